@@ -1,7 +1,7 @@
 //! Photos to a scene directory: `cargo run --release --example run -- out/kitchen my-photos
 //! [TEXT...]`.
 use splatvk::progress::Progress;
-use splatvk::run::{self, RunOutcome, RunPlan};
+use splatvk::run::{self, Destination, Inputs, RunOutcome, RunPlan};
 use splatvk::{Error, Result};
 use std::process::ExitCode;
 
@@ -31,7 +31,8 @@ fn reconstruct(plan: &RunPlan) -> Result<RunOutcome> {
     match run::run(plan, &Lines) {
         Err(error @ Error::DeviceLost { kept: Some(_), .. }) => {
             eprintln!("{error}");
-            run::run(&RunPlan { resume: true, ..plan.clone() }, &Lines)
+            let output = Destination { resume: true, ..plan.output.clone() };
+            run::run(&RunPlan { output, ..plan.clone() }, &Lines)
         }
         other => other,
     }
@@ -44,16 +45,19 @@ fn main() -> ExitCode {
         return ExitCode::from(2);
     };
     let plan = RunPlan {
-        inputs: vec![photos.into()],
-        views: Some(4),
-        out: out.into(),
-        queries: arguments.collect(),
+        inputs: Inputs {
+            photos: vec![photos.into()],
+            views: Some(4),
+            queries: arguments.collect(),
+            ..Inputs::default()
+        },
+        output: Destination { out: out.into(), ..Destination::default() },
         ..RunPlan::default()
     };
     match reconstruct(&plan) {
         Ok(made) => {
             println!("{} splats, {:.1} dB on the photos", made.splats.len(), made.rgb.mean_psnr());
-            for answer in &made.answers {
+            for answer in made.language.iter().flat_map(|l| &l.answers) {
                 println!("{}: in {} of {} photos", answer.text, answer.found(), answer.views.len());
             }
             ExitCode::SUCCESS

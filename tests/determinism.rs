@@ -1,11 +1,11 @@
-//! `--deterministic`: the command line, the Rust interface and the C interface, with different
-//! numbers of host threads, make the same bits of the same photos, and the same renders and answers
-//! of them.
+//! `--deterministic`: from the same photos, the command line, the Rust interface and the C
+//! interface, with different numbers of host threads, produce the same bits, and the same renders
+//! and answers.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks)] // a panic is how a test fails
 mod fixture;
 
 use splatvk::capi::*;
-use splatvk::run::{self, RunPlan};
+use splatvk::run::{self, Destination, Inputs, ReconstructionConfig, RunPlan, TrainingConfig};
 use std::collections::BTreeMap;
 use std::ffi::CString;
 use std::path::{Path, PathBuf};
@@ -15,9 +15,9 @@ use std::ptr::null_mut;
 const SIZE: usize = 160;
 const ITERATIONS: usize = 40;
 const QUERY: &str = "lemon";
-/// They state times, memory and where the scene was written.
+/// Files that contain times, memory and the path of the scene.
 const OF_THE_RUN: [&str; 2] = ["run.json", "report.html"];
-/// So do these lines of `answers.json`.
+/// Lines of `answers.json` that contain times and paths.
 const OF_THE_QUERY: [&str; 3] = ["\"out\":", "\"scene\":", "\"milliseconds\":"];
 
 fn photos(folder: &Path) -> Vec<PathBuf> {
@@ -35,7 +35,7 @@ fn photos(folder: &Path) -> Vec<PathBuf> {
     (0..3).map(small).collect()
 }
 
-/// The program with so many threads of its own and of lavapipe's.
+/// The program with numbers of its own threads and of lavapipe's.
 fn splatvk(threads: [&str; 2]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));
     command.env("RAYON_NUM_THREADS", threads[0]).env("LP_NUM_THREADS", threads[1]);
@@ -58,22 +58,24 @@ fn from_shell(photos: &[PathBuf], out: &Path, threads: [&str; 2]) {
 }
 
 fn from_rust(photos: &[PathBuf], out: &Path) {
-    let plan = RunPlan {
-        inputs: photos.to_vec(),
-        out: out.into(),
+    let training = TrainingConfig {
         preset: Some(splatvk::fit::Preset::Draft),
         iterations: Some(ITERATIONS),
         max_size: Some(SIZE),
         deterministic: true,
-        queries: vec![QUERY.into()],
+        ..TrainingConfig::default()
+    };
+    let plan = RunPlan {
+        inputs: Inputs { photos: photos.to_vec(), queries: vec![QUERY.into()], ..Inputs::default() },
+        config: ReconstructionConfig { training, ..ReconstructionConfig::default() },
+        output: Destination { out: out.into(), ..Destination::default() },
         ..RunPlan::default()
     };
     run::run(&plan, &splatvk::progress::Silent).unwrap();
 }
 
 fn from_c(photos: &[PathBuf], out: &Path) {
-    let text = |path: &Path| CString::new(path.to_str().unwrap()).unwrap();
-    let files: Vec<CString> = photos.iter().map(|p| text(p)).collect();
+    let files: Vec<CString> = photos.iter().map(|p| c_path(p)).collect();
     // The zero bytes of the structures are their defaults.
     unsafe {
         let mut options: SvkContextOptions = std::mem::zeroed();
@@ -91,13 +93,17 @@ fn from_c(photos: &[PathBuf], out: &Path) {
         options.preset = SvkPreset::Draft as u32;
         (options.iterations, options.max_size) = (ITERATIONS as u64, SIZE as u64);
         assert_eq!(svk_train(context, given.as_ptr(), given.len(), &options, &mut scene), SvkStatus::Ok);
-        assert_eq!(svk_scene_save(scene, text(out).as_ptr(), 0), SvkStatus::Ok);
+        assert_eq!(svk_scene_save(scene, c_path(out).as_ptr(), 0), SvkStatus::Ok);
         svk_scene_destroy(scene);
         svk_context_destroy(context);
     }
 }
 
-/// Every file under a folder by its name.
+fn c_path(path: &Path) -> CString {
+    CString::new(path.to_str().unwrap()).unwrap()
+}
+
+/// All files under a folder, by name.
 fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     let mut found = BTreeMap::new();
     let mut open = vec![folder.to_owned()];
@@ -123,8 +129,7 @@ fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
     found
 }
 
-/// Whether two folders hold the same bytes; `without` names folders that the second one need not
-/// have.
+/// Asserts that two folders contain the same bytes; the second may lack the folders `without`.
 fn assert_same(a: &Path, b: &Path, without: &[&str]) {
     let (mut a, b) = (files(a), files(b));
     a.retain(|name, _| !without.iter().any(|w| name.starts_with(w)));
@@ -136,31 +141,37 @@ fn assert_same(a: &Path, b: &Path, without: &[&str]) {
 }
 
 #[test]
-fn the_same_photos_give_the_same_bits_from_everywhere() {
+fn run_repeats_bits_from_any_folder() {
     let folder = tempfile::tempdir().unwrap();
     let photos = photos(folder.path());
-    let at = |name: &str| folder.path().join(name);
-    // With three threads and one of the device; the others have as many as there are cores.
-    from_shell(&photos, &at("shell"), ["3", "1"]);
-    from_rust(&photos, &at("rust"));
-    assert_same(&at("shell"), &at("rust"), &[]);
-    from_c(&photos, &at("c"));
-    assert_same(&at("shell"), &at("c"), &["previews/query_"]);
+    let path_of = |name: &str| folder.path().join(name);
+    // With three threads and one of the device; the others use as many as there are cores.
+    from_shell(&photos, &path_of("shell"), ["3", "1"]);
+    from_rust(&photos, &path_of("rust"));
+    assert_same(&path_of("shell"), &path_of("rust"), &[]);
+    from_c(&photos, &path_of("c"));
+    assert_same(&path_of("shell"), &path_of("c"), &["previews/query_"]);
 
     let answers = |scene: &str, threads, out: &str| {
-        output(splatvk(threads).args(["query", "--json"]).arg(at(scene)).args([QUERY, "--out"]).arg(at(out)));
-        let cameras = at(scene).join("cameras/transforms.json");
+        output(
+            splatvk(threads)
+                .args(["query", "--json"])
+                .arg(path_of(scene))
+                .args([QUERY, "--out"])
+                .arg(path_of(out)),
+        );
+        let cameras = path_of(scene).join("cameras/transforms.json");
         output(
             splatvk(threads)
                 .arg("render")
-                .arg(at(scene))
+                .arg(path_of(scene))
                 .arg("--cameras")
                 .arg(cameras)
                 .arg("--out")
-                .arg(at(out).join("renders")),
+                .arg(path_of(out).join("renders")),
         );
     };
     answers("shell", ["1", "2"], "answers-shell");
     answers("rust", ["3", "1"], "answers-rust");
-    assert_same(&at("answers-shell"), &at("answers-rust"), &[]);
+    assert_same(&path_of("answers-shell"), &path_of("answers-rust"), &[]);
 }

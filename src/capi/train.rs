@@ -9,10 +9,13 @@ use crate::infer::installed::{Inventory, inventory};
 use crate::photo::{self, MaskChoice, Photo};
 use crate::pose::choose;
 use crate::progress::Progress;
-use crate::run::compat::{self, Compat};
 use crate::run::live::LiveScene;
-use crate::run::sources::{self, SourceChoice, SourceKind, choose};
-use crate::run::{self, Method, RunPlan};
+use crate::run::sources::{
+    self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind,
+};
+use crate::run::{
+    self, Compat, Extras, GeometryConfig, LanguageConfig, Method, ReconstructionConfig, TrainingConfig,
+};
 use crate::scene::{Camera, GivenCamera, Image, MAX_PIXELS, RgbImage};
 use std::path::{Path, PathBuf};
 
@@ -41,7 +44,7 @@ pub unsafe extern "C" fn svk_train(
             let given = boundary::read_array(photos, photo_count)?;
             // What is wrong with the options is said before the photos are read.
             let networks = inventory(&context.registry);
-            let mut plan = plan(&options, &networks)?;
+            let config = config(&options, &networks)?;
             let progress = Callback::new(options.progress, options.user);
             let max_size = match options.max_size as usize {
                 0 => photo::default_max_size(context.device.info().is_cpu),
@@ -51,16 +54,15 @@ pub unsafe extern "C" fn svk_train(
                 n => n,
             };
             let (photos, cameras) = gather(&given, options.views as usize, max_size, &progress)?;
-            plan.inputs = photos.iter().map(|p| p.path.clone()).collect();
-            if !cameras.is_empty() {
-                if plan.init != RunPlan::default().init {
-                    return bad_argument(
-                        "cameras are given with the photos and in the options; give one of them",
-                    );
-                }
-                plan.cameras = cameras.into_iter().map(GivenCamera::from).collect();
+            if !cameras.is_empty() && config.geometry.init != GeometryConfig::default().init {
+                return bad_argument(
+                    "cameras are given with the photos and in the options; give one of them",
+                );
             }
-            let outcome = run::reconstruct(&plan, &context.device, &context.registry, photos, &progress)?;
+            let cameras = cameras.into_iter().map(GivenCamera::from).collect();
+            let extras = Extras { cameras, ..Extras::default() };
+            let (device, registry) = (&context.device, &context.registry);
+            let outcome = run::reconstruct(&config, &extras, device, registry, photos, &progress)?;
             let live = LiveScene::trained(&context.device, outcome, &context.registry)?;
             *slot = SvkScene::boxed(live);
         }
@@ -180,7 +182,7 @@ unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, CallError> {
     Ok(RgbImage { width, height, data })
 }
 
-unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, CallError> {
+unsafe fn config(o: &SvkTrainOptions, networks: &Inventory) -> Result<ReconstructionConfig, CallError> {
     let preset = match o.preset {
         0 => None,
         1 => Some(Preset::Draft),
@@ -203,59 +205,47 @@ unsafe fn plan(o: &SvkTrainOptions, networks: &Inventory) -> Result<RunPlan, Cal
     // SAFETY: as above.
     let path = |pointer, field: &str| unsafe { boundary::path(pointer, &format!("SvkTrainOptions.{field}")) };
     let count = |n: u64| usize::try_from(n).ok().filter(|n| *n > 0);
-    let compat = text(o.compat, "compat")?.map_or(Ok(None), |name| Compat::named(&name))?;
-    let language_iterations = count(o.language_iterations);
-    let per_level = o.per_level != 0 || compat.is_some_and(|c| c.per_level);
-    let method = match text(o.method, "method")? {
-        Some(name) => Method::named(&name)?,
-        None => Method::by_default(preset, language_iterations, per_level),
-    };
-    Ok(RunPlan {
-        preset,
-        init: source::<sources::GeometrySources>(
-            text(o.init, "init")?,
-            path(o.cameras, "cameras")?.map(|file| SourceChoice::with("cameras", file)),
-            networks,
-        )?,
-        depth_prior: source::<sources::DepthSources>(text(o.depth_prior, "depth_prior")?, None, networks)?,
-        matcher: source::<sources::MatchSources>(text(o.matcher, "matcher")?, None, networks)?,
-        masks: source::<sources::MaskSources>(
-            text(o.mask_source, "mask_source")?,
-            path(o.masks, "masks")?.map(|dir| SourceChoice::with("dir", dir)),
-            networks,
-        )?,
-        features: source::<sources::FeatureSources>(
-            text(o.feature_source, "feature_source")?,
-            path(o.features, "features")?.map(|dir| SourceChoice::with("dir", dir)),
-            networks,
-        )?,
-        seed: o.seed,
-        iterations: count(o.iterations),
-        language_iterations,
-        sh_degree,
-        method: Some(method),
-        feature_dim: if o.feature_dim == 0 {
-            compat::feature_dim(compat, method)
-        } else {
-            o.feature_dim as usize
+    let cameras = path(o.cameras, "cameras")?.map(|file| SourceChoice::with("cameras", file));
+    let masks = path(o.masks, "masks")?.map(|folder| SourceChoice::with("dir", folder));
+    let features = path(o.features, "features")?.map(|folder| SourceChoice::with("dir", folder));
+    let config = ReconstructionConfig {
+        geometry: GeometryConfig {
+            init: source::<GeometrySources>(text(o.init, "init")?, cameras)?,
+            depth_prior: source::<DepthSources>(text(o.depth_prior, "depth_prior")?, None)?,
         },
-        per_level,
-        ..RunPlan::default()
-    }
-    .compatible(compat))
+        training: TrainingConfig {
+            preset,
+            max_size: None,
+            iterations: count(o.iterations),
+            sh_degree,
+            seed: o.seed,
+            deterministic: false,
+        },
+        language: Some(LanguageConfig {
+            matcher: source::<MatchSources>(text(o.matcher, "matcher")?, None)?,
+            masks: source::<MaskSources>(text(o.mask_source, "mask_source")?, masks)?,
+            features: source::<FeatureSources>(text(o.feature_source, "feature_source")?, features)?,
+            language_iterations: count(o.language_iterations),
+            feature_dim: count(u64::from(o.feature_dim)),
+            method: text(o.method, "method")?.map(|name| Method::named(&name)).transpose()?,
+            per_level: o.per_level != 0,
+            compat: text(o.compat, "compat")?.map_or(Ok(None), |name| Compat::named(&name))?,
+            ..LanguageConfig::default()
+        }),
+    };
+    Ok(config.resolved(networks)?)
 }
 
 /// A source by its name, or by the file or folder that an older field holds, or the built-in one.
 fn source<K: SourceKind>(
     named: Option<String>,
     given: Option<SourceChoice>,
-    networks: &Inventory,
 ) -> Result<SourceChoice, CallError> {
     match (named, given) {
         (Some(_), Some(given)) => {
             bad_argument(format!("{}: {given} is given twice; give one of the two", K::OPTION))
         }
-        (Some(text), None) => Ok(choose::<K>(&text, networks)?),
+        (Some(text), None) => Ok(SourceChoice::from(text.as_str())),
         (None, given) => Ok(given.unwrap_or_else(sources::default::<K>)),
     }
 }

@@ -1,19 +1,20 @@
 //! Command-line arguments.
 use crate::infer::provider;
+use crate::run::TrainingConfig;
 use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
 mod bench;
-mod number;
 mod shared;
 
 pub use super::export::ExportArgs;
 pub use super::measure::MeasureArgs;
 pub use super::run::RunArgs;
+pub use crate::run::config::whole;
+pub use crate::run::config::{EXPERTS, compat_names as compats};
 pub use bench::{BenchArgs, BenchPart};
-pub use number::whole;
-pub use shared::{DeviceArgs, EXPERTS, LogFormat, MACHINE, MakingArgs, PresetArg, compats};
+pub use shared::{DeviceArgs, LogFormat, MACHINE, SavingArgs};
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
@@ -127,9 +128,12 @@ pub struct TrainArgs {
     /// Scene directory to write
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// How the scene is made
+    /// Working size and training
     #[command(flatten)]
-    pub making: MakingArgs,
+    pub training: TrainingConfig,
+    /// Where the scene is written
+    #[command(flatten)]
+    pub saving: SavingArgs,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

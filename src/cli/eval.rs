@@ -62,7 +62,7 @@ fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery
     let registry = args.device.registry()?;
     let mut encoder = encoder::of_scene(scene, registry)?;
     let queries = ask::embedded(texts, encoder.as_mut())?;
-    encoder.doubt().iter().for_each(|doubt| progress::reporter().warn(doubt));
+    encoder.embedding_warning().iter().for_each(|warning| progress::reporter().warn(warning));
     Ok(queries)
 }
 

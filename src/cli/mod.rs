@@ -11,7 +11,6 @@ mod line;
 mod measure;
 mod models;
 pub mod outputs;
-mod plan;
 pub mod print;
 pub mod progress;
 mod query;

@@ -104,7 +104,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         let Some(answers) = &asked.answers else { continue };
         let mut entry = answers.record(&stems, &scene.world);
         (entry["milliseconds"], entry["views"]) = (asked.milliseconds.into(), asked.views.clone().into());
-        entry["embedded_by"] = json!(ready.encoder().embedded_by(&answers.text));
+        entry["embedded_by"] = json!(ready.encoder().embedding_source(&answers.text));
         if let Some(out) = out.as_mut().filter(|_| args.splats) {
             let (chosen, name) = (&answers.selection, format!("{folder}/splats.ply"));
             let carrier = ready.field().levels[chosen.level].carrier(&scene.splats);
@@ -116,7 +116,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
         }
         queries.push(entry);
     }
-    ready.encoder().doubt().iter().for_each(|doubt| progress.warn(doubt));
+    ready.encoder().embedding_warning().iter().for_each(|warning| progress.warn(warning));
     let report = json!({ "scene": args.scene, "out": args.out, "world": scene.world, "queries": queries });
     if let Some(mut out) = out {
         write_json(&out.file("answers.json")?, &report)?;

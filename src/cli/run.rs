@@ -1,25 +1,18 @@
 //! `splatvk run`
-use super::args::{DeviceArgs, EXPERTS, MakingArgs, compats, whole};
+use super::args::{DeviceArgs, SavingArgs, whole};
 use super::kept::tell_of_kept_stages;
-use super::plan;
 use super::print::{ending, print, print_json};
 use super::progress;
 use crate::infer::installed::{Inventory, inventory};
-use crate::language::Reducer;
-use crate::language::sam::SamOptions;
 use crate::photo::MAX_VIEWS;
-use crate::query::phrasing;
-use crate::run::base::Settings;
-use crate::run::compat::{self, Compat};
-use crate::run::method::{METHODS, SPARSELGS};
-use crate::run::sources::{
-    self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind,
-    choose,
+use crate::run::base;
+use crate::run::method::SPARSELGS;
+use crate::run::sources::{FeatureSources, MaskSources, MatchSources, SourceChoice, SourceKind, choose};
+use crate::run::{
+    GeometryConfig, Inputs, LanguageConfig, ReconstructionConfig, RunPlan, RunRecord, TrainingConfig,
 };
-use crate::run::{Method, RunPlan};
 use crate::{Error, Result, files};
 use clap::Args;
-use clap::builder::{PossibleValue, PossibleValuesParser};
 use std::path::{Path, PathBuf};
 
 /// `splatvk run`
@@ -42,183 +35,122 @@ pub struct RunArgs {
     /// --out, the larger scene stands beside it under the next number, and the old one stays
     #[arg(long, value_name = "SCENE", conflicts_with_all = ["views", "init", "depth_prior", "method", "feature_dim", "per_level", "compat"])]
     pub add: Option<PathBuf>,
-    /// How the scene is made
+    /// Working size and training
     #[command(flatten)]
-    pub making: MakingArgs,
-    /// Source of cameras, depth and points
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<GeometrySources>(), help_heading = SOURCES)]
-    pub init: String,
-    /// Source of depth where photos cannot be matched
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<DepthSources>(), help_heading = SOURCES)]
-    pub depth_prior: String,
-    /// Source of dense matches
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MatchSources>(), help_heading = SOURCES)]
-    pub matcher: String,
-    /// Source of masks
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<MaskSources>(), help_heading = SOURCES)]
-    pub masks: String,
-    /// Source of features
-    #[arg(long, default_value = "auto", value_name = "SOURCE", help = sources::help::<FeatureSources>(), help_heading = SOURCES)]
-    pub features: String,
-    /// Points along each side of a photo at which a mask network is asked
-    #[arg(long, default_value_t = 32, value_name = "N", value_parser = whole::<usize>(1..=128), help_heading = SOURCES)]
-    pub mask_points: usize,
-    /// Do not ask the mask network about four overlapping crops as well: five times faster, misses
-    /// small things
-    #[arg(long, help_heading = SOURCES)]
-    pub no_mask_crops: bool,
-    /// Optimisation steps of the language stage, instead of the preset's
-    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..), help_heading = EXPERTS)]
-    pub language_iterations: Option<usize>,
-    /// Length of the codes that splats carry: 3, 8 or 16 [default: 16; --compat and langsplat 3,
-    /// legaussians 8]
-    #[arg(long, value_name = "D", value_parser = whole::<usize>(3..=16), help_heading = EXPERTS)]
-    pub feature_dim: Option<usize>,
-    /// How language gets onto the splats: this program's ways, or a baseline on the same geometry
-    /// to compare with [default: lift; sparselgs with --preset paper, --language-iterations,
-    /// --per-level or --compat]
-    #[arg(long, value_parser = methods(), value_name = "METHOD", help_heading = EXPERTS)]
-    pub method: Option<String>,
-    /// One model per level as in the paper, instead of one geometry for all three
-    #[arg(long, help_heading = EXPERTS)]
-    pub per_level: bool,
-    /// Do what can be done in several ways as the paper, its authors' code or LangSplat: area score
-    /// and conditions of the alignment, order of masks, one model per level, 3 numbers per code,
-    /// level and mask of answers
-    #[arg(long, value_parser = compats(), value_name = "WHOSE", help_heading = EXPERTS)]
-    pub compat: Option<String>,
+    pub training: TrainingConfig,
+    /// Where the scene is written
+    #[command(flatten)]
+    pub saving: SavingArgs,
+    /// Sources of cameras and depth
+    #[command(flatten)]
+    pub geometry: GeometryConfig,
+    /// Masks, features and codes
+    #[command(flatten)]
+    pub language: LanguageConfig,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
 }
 
-/// Heading of the options that say where the parts of a scene come from.
-const SOURCES: &str = "Sources and networks";
-
 fn views() -> impl Fn(&str) -> std::result::Result<usize, String> + Clone + Send + Sync {
     whole(2..=MAX_VIEWS as u64)
 }
 
-fn methods() -> PossibleValuesParser {
-    PossibleValuesParser::new(METHODS.map(|m| PossibleValue::new(m.name).help(m.about)))
-}
-
 pub fn run(args: &RunArgs) -> Result<()> {
-    let installed = inventory(&args.device.registry()?);
-    let plan = match &args.add {
-        Some(scene) => joining(args, scene, &installed)?,
-        None => plan(args, &installed)?,
-    };
+    let plan = plan(args, &inventory(&args.device.registry()?))?;
     let progress = progress::reporter();
     let outcome = crate::run::run(&plan, progress.as_ref())?;
     if args.device.json {
         let record = serde_json::to_value(crate::run::run_record(&outcome));
         print_json(&record.map_err(|e| Error::work(format!("run record: {e}")))?)?;
     } else {
-        print(&(crate::run::closing_table(&outcome) + &ending(&outcome.plan.out)))?;
+        print(&(crate::run::closing_table(&outcome) + &ending(&outcome.plan.output.out)))?;
     }
     tell_of_kept_stages(progress.as_ref());
     Ok(())
 }
 
-/// What the arguments mean: defaults resolved, names understood, contradictions refused; `auto` is
-/// the best of `installed`, or what is built in. No work happens here.
+/// The plan of the arguments: sources named, contradictions refused. No work happens here.
 fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
-    let compat = args.compat.as_deref().map_or(Ok(None), Compat::named)?;
-    let preset = args.making.preset.map(plan::preset);
-    let per_level = args.per_level || compat.is_some_and(|c| c.per_level);
-    let method = match &args.method {
-        Some(name) => Method::named(name)?,
-        None => Method::by_default(preset, args.language_iterations, per_level),
+    let asked = ReconstructionConfig {
+        geometry: args.geometry.clone(),
+        training: args.training.clone(),
+        language: Some(args.language.clone()),
     };
-    let recipe = method.recipe;
-    let feature_dim = args.feature_dim.unwrap_or_else(|| compat::feature_dim(compat, method));
-    if ![3, 8, 16].contains(&feature_dim) {
-        return Err(Error::input(format!("--feature-dim {feature_dim}: choose 3, 8 or 16")));
-    }
-    if matches!(recipe.reducer, Reducer::Autoencoder { .. }) && feature_dim != 3 {
-        return Err(Error::input(format!(
-            "--feature-dim {feature_dim}: the autoencoder of --method langsplat has 3 dimensions; leave it out"
-        )));
-    }
-    for text in &args.queries {
-        phrasing::check(text).map_err(|e| Error::input(format!("--query: {e}")))?;
-    }
-    let init = choose::<GeometrySources>(&args.init, installed)?;
-    // A network that gives depth itself needs none suggested.
-    let measured = GeometrySources::SOURCES.iter().any(|s| s.name == init.name);
-    let depth_prior = match args.depth_prior.as_str() {
-        "auto" if !measured => sources::default::<DepthSources>(),
-        text => choose::<DepthSources>(text, installed)?,
+    let mut queries = args.queries.clone();
+    let config = match &args.add {
+        None => asked.resolved(installed)?,
+        Some(scene) => {
+            let made = base::record_of(scene)?;
+            // Queries that were asked, then those that are new.
+            queries = made.config.plan.inputs.queries.clone();
+            queries.extend(
+                args.queries.iter().filter(|q| !made.config.plan.inputs.queries.contains(q)).cloned(),
+            );
+            as_made(asked, &made, installed)?
+        }
+    };
+    let out = match (&args.out, &args.add) {
+        (Some(out), _) => out.clone(),
+        (None, Some(scene)) => files::next_free(scene),
+        (None, None) => default_out(&args.inputs),
     };
     Ok(RunPlan {
-        inputs: args.inputs.clone(),
-        add: None,
-        views: args.views,
-        out: args.out.clone().unwrap_or_else(|| default_out(&args.inputs)),
-        force: args.making.force,
-        photo_masks: args.making.photo_masks.clone(),
-        resume: args.making.resume,
-        checkpoint_seconds: args.making.checkpoint_seconds,
-        preset,
-        init,
-        depth_prior,
-        matcher: choose::<MatchSources>(&args.matcher, installed)?,
-        masks: choose::<MaskSources>(&args.masks, installed)?,
-        sam: SamOptions { points: args.mask_points, crops: !args.no_mask_crops, ..SamOptions::default() },
-        features: choose::<FeatureSources>(&args.features, installed)?,
-        queries: args.queries.clone(),
-        seed: args.making.seed,
-        iterations: args.making.iterations,
-        language_iterations: args.language_iterations,
-        sh_degree: args.making.sh_degree,
-        method: Some(method),
-        feature_dim,
-        per_level,
-        compat: None,
-        max_size: args.making.max_size,
-        device: args.device.device.clone(),
-        deterministic: args.making.deterministic,
-        cameras: Vec::new(),
-        models: args.device.models.clone(),
-        provider: args.device.provider.clone(),
-    }
-    .compatible(compat))
+        inputs: Inputs {
+            photos: args.inputs.clone(),
+            add: args.add.clone(),
+            views: args.views,
+            photo_masks: args.saving.photo_masks.clone(),
+            points: None,
+            queries,
+        },
+        config,
+        machine: args.device.machine(),
+        output: args.saving.destination(out),
+    })
 }
 
-/// The plan for photos that join a scene: what the arguments leave open is as the scene was made.
-fn joining(args: &RunArgs, scene: &Path, installed: &Inventory) -> Result<RunPlan> {
-    let made = Settings::read(scene)?;
-    let plan = plan(args, installed)?;
-    let compat = made.compat().map_or(Ok(None), Compat::named)?;
-    Ok(RunPlan {
-        add: Some(scene.to_path_buf()),
-        out: args.out.clone().unwrap_or_else(|| files::next_free(scene)),
-        preset: plan.preset.or(made.preset()),
-        init: sources::default::<GeometrySources>(),
-        depth_prior: sources::default::<DepthSources>(),
-        matcher: as_made::<MatchSources>(&made, &args.matcher, installed)?,
-        masks: as_made::<MaskSources>(&made, &args.masks, installed)?,
-        features: as_made::<FeatureSources>(&made, &args.features, installed)?,
-        feature_dim: made.feature_dim().unwrap_or(plan.feature_dim),
-        per_level: made.per_level(),
-        // Steps that are asked for are done.
-        method: Some(if plan.method() == &SPARSELGS { plan.method() } else { made.method()? }),
-        queries: made.queries(&plan.queries),
-        ..plan
+/// The configuration of photos that join a scene: settings that are left open are those of the
+/// scene.
+fn as_made(
+    asked: ReconstructionConfig,
+    made: &RunRecord,
+    installed: &Inventory,
+) -> Result<ReconstructionConfig> {
+    let method = asked.language.as_ref().map(|l| l.method(asked.training.preset));
+    let of_scene = made.config.plan.config.language.clone().unwrap_or_default();
+    let language = asked.language.unwrap_or_default();
+    ReconstructionConfig {
+        geometry: GeometryConfig::default(),
+        training: TrainingConfig { preset: asked.training.preset.or(made.config.preset), ..asked.training },
+        language: Some(LanguageConfig {
+            matcher: source_as_made::<MatchSources>(language.matcher, of_scene.matcher, installed)?,
+            masks: source_as_made::<MaskSources>(language.masks, of_scene.masks, installed)?,
+            features: source_as_made::<FeatureSources>(language.features, of_scene.features, installed)?,
+            feature_dim: of_scene.feature_dim,
+            per_level: of_scene.per_level,
+            compat: of_scene.compat,
+            // Steps that are asked for are done.
+            method: method.filter(|m| *m == &SPARSELGS).or(of_scene.method),
+            ..language
+        }),
     }
-    .compatible(compat))
+    .resolved(installed)
 }
 
 /// The source that is asked for; where that is left open, the one that the scene was made with.
-fn as_made<K: SourceKind>(made: &Settings, asked: &str, installed: &Inventory) -> Result<SourceChoice> {
-    let Some(recorded) = made.source(K::OPTION).filter(|_| asked == "auto") else {
-        return choose::<K>(asked, installed);
-    };
+fn source_as_made<K: SourceKind>(
+    asked: SourceChoice,
+    made: SourceChoice,
+    installed: &Inventory,
+) -> Result<SourceChoice> {
+    if asked.name != "auto" {
+        return Ok(asked);
+    }
     // The scene knows no folders: it may have come from elsewhere.
-    choose::<K>(recorded, installed).map_err(|e| {
+    choose::<K>(&made.to_string(), installed).map_err(|e| {
         let option = K::OPTION;
-        Error::input(format!("{e} (the scene was made with --{option} {recorded}; give --{option} again)"))
+        Error::input(format!("{e} (the scene was made with --{option} {made}; give --{option} again)"))
     })
 }
 
@@ -238,10 +170,16 @@ mod tests {
     use crate::cli::args::{Cli, Command};
     use crate::infer::installed::{Installed, Task};
     use crate::language::align::{AlignOptions, AreaScore};
+    use crate::language::sam::SamOptions;
+    use crate::run::Method;
     use clap::Parser;
 
     fn named(name: &str) -> SourceChoice {
         SourceChoice::named(name)
+    }
+
+    fn language(plan: &RunPlan) -> LanguageConfig {
+        plan.config.language.clone().unwrap()
     }
 
     fn plan(extra: &[&str]) -> Result<RunPlan> {
@@ -259,11 +197,15 @@ mod tests {
     #[test]
     fn defaults_are_the_built_in_models() {
         let plan = plan(&[]).unwrap();
-        assert_eq!(plan.out, Path::new("out/breakfast"));
-        assert_eq!(plan.method().name, "lift");
-        assert_eq!((plan.init, plan.masks), (named("sfm"), named("graph")));
-        assert_eq!((plan.features, plan.feature_dim), (named("words"), 16));
-        assert_eq!((plan.matcher, plan.sam), (named("xfeat"), SamOptions::default()));
+        assert_eq!(plan.output.out, Path::new("out/breakfast"));
+        let ours = LanguageConfig {
+            method: Some(Method::named("lift").unwrap()),
+            feature_dim: Some(16),
+            ..LanguageConfig::default()
+        };
+        assert_eq!(ours.sam(), SamOptions::default());
+        let config = ReconstructionConfig { language: Some(ours), ..ReconstructionConfig::default() };
+        assert_eq!(plan.config, config);
     }
 
     #[test]
@@ -272,7 +214,7 @@ mod tests {
         for (name, preset) in
             [("draft", Preset::Draft), ("default", Preset::Default), ("paper", Preset::Paper)]
         {
-            assert_eq!(plan(&["--preset", name]).unwrap().preset, Some(preset));
+            assert_eq!(plan(&["--preset", name]).unwrap().config.training.preset, Some(preset));
         }
     }
 
@@ -282,12 +224,11 @@ mod tests {
         let made = serde_json::json!({ "method": "lift", "masks": "dir:src", "features": "dir:tests" });
         let record = serde_json::json!({ "config": { "plan": made } });
         std::fs::write(folder.path().join("run.json"), record.to_string()).unwrap();
-        let line = ["splatvk", "run", "new.jpg", "--features", "words"];
-        let Command::Run(args) = Cli::try_parse_from(line).unwrap().command else { unreachable!() };
-        let plan = super::joining(&args, folder.path(), &Inventory::default()).unwrap();
-        assert_eq!(plan.masks, SourceChoice::with("dir", "src"));
+        let plan = plan(&["--add", folder.path().to_str().unwrap(), "--features", "words"]).unwrap();
+        let language = language(&plan);
+        assert_eq!(language.masks, SourceChoice::with("dir", "src"));
         assert_eq!(
-            (plan.features, plan.matcher),
+            (language.features, language.matcher),
             (named("words"), named("xfeat")),
             "asked for, not recorded"
         );
@@ -313,38 +254,41 @@ mod tests {
         ];
         let installed = Inventory { models: models.map(|(n, d)| model(n, d)).into(), broken: Vec::new() };
         let plan = plan_with(&[], &installed).unwrap();
-        assert_eq!(plan.masks, named("sam_vit_h"));
-        assert_eq!(plan.features, named("mine"));
-        assert_eq!(plan.init, named("mast3r_512"));
-        assert_eq!(plan.matcher, named("xfeat"));
+        let found = language(&plan);
+        assert_eq!((found.masks, found.features), (named("sam_vit_h"), named("mine")));
+        assert_eq!((plan.config.geometry.init, found.matcher), (named("mast3r_512"), named("xfeat")));
         // Depth of a geometry network needs no suggestion, that of stereo takes what there is.
-        assert_eq!(plan.depth_prior, named("none"));
+        assert_eq!(plan.config.geometry.depth_prior, named("none"));
         let plan =
             plan_with(&["--masks", "graph", "--init", "sfm", "--features", "words"], &installed).unwrap();
-        assert_eq!(plan.depth_prior, named("depth_anything_v2_small"));
-        assert_eq!((plan.init, plan.masks, plan.features), (named("sfm"), named("graph"), named("words")));
+        let found = language(&plan);
+        let GeometryConfig { init, depth_prior } = plan.config.geometry;
+        assert_eq!((init, depth_prior), (named("sfm"), named("depth_anything_v2_small")));
+        assert_eq!((found.masks, found.features), (named("graph"), named("words")));
     }
 
     #[test]
     fn each_method_has_its_own_code_length() {
         for (name, dim) in [("sparselgs", 16), ("langsplat", 3), ("legaussians", 8), ("lsm", 16)] {
-            assert_eq!(plan(&["--method", name]).unwrap().feature_dim, dim, "{name}");
+            let plan = plan(&["--method", name]).unwrap();
+            assert_eq!(language(&plan).feature_dim, Some(dim), "{name}");
         }
     }
 
     #[test]
     fn what_others_do_is_resolved_in_the_plan() {
-        let ours = plan(&[]).unwrap();
-        assert_eq!(ours.recipe().align, AlignOptions::default());
-        let paper = plan(&["--compat", "paper"]).unwrap();
-        let area = paper.recipe().align.area;
-        assert_eq!((paper.feature_dim, paper.per_level, area), (3, true, AreaScore::Paper));
+        let resolved = |extra: &[&str]| language(&plan(extra).unwrap());
+        assert_eq!(resolved(&[]).recipe(None).align, AlignOptions::default());
+        let paper = resolved(&["--compat", "paper"]);
+        assert_eq!((paper.feature_dim, paper.per_level), (Some(3), true));
+        assert_eq!(paper.recipe(None).align.area, AreaScore::Paper);
         assert_eq!(serde_json::to_value(&paper).unwrap()["compat"], "paper");
-        let authors = plan(&["--compat", "authors", "--feature-dim", "8"]).unwrap();
-        assert_eq!((authors.feature_dim, authors.sam.paint_in_order), (8, true));
-        assert!(!authors.recipe().build("x", 0).align.fusion, "dead at its own thresholds");
-        let theirs = plan(&["--compat", "langsplat", "--method", "legaussians"]).unwrap();
-        assert_eq!((theirs.feature_dim, theirs.recipe().build("x", 0).align.matching), (8, false));
+        let authors = resolved(&["--compat", "authors", "--feature-dim", "8"]);
+        assert_eq!((authors.feature_dim, authors.sam().paint_in_order), (Some(8), true));
+        assert!(!authors.recipe(None).build("x", 0).align.fusion, "dead at its own thresholds");
+        let theirs = resolved(&["--compat", "langsplat", "--method", "legaussians"]);
+        assert_eq!(theirs.feature_dim, Some(8));
+        assert!(!theirs.recipe(None).build("x", 0).align.matching);
     }
 
     #[test]
@@ -352,10 +296,9 @@ mod tests {
         let plan =
             plan(&["--init", "dust3r", "--matcher", "roma", "--masks", "sam_vit_h", "--features", "clip"])
                 .unwrap();
-        assert_eq!(plan.init, named("dust3r"));
-        assert_eq!(plan.matcher, named("roma"));
-        assert_eq!(plan.masks, named("sam_vit_h"));
-        assert_eq!(plan.features, named("clip"));
+        let found = language(&plan);
+        assert_eq!((plan.config.geometry.init, found.matcher), (named("dust3r"), named("roma")));
+        assert_eq!((found.masks, found.features), (named("sam_vit_h"), named("clip")));
     }
 
     #[test]
@@ -370,7 +313,7 @@ mod tests {
             (["--query", " "], "a few words"),
             (["--method=langsplat", "--feature-dim=16"], "has 3 dimensions"),
         ] {
-            let error = plan(&extra).unwrap_err();
+            let error = plan(&extra).and_then(|plan| plan.inputs.check()).unwrap_err();
             assert!(error.exit_code() == 2 && error.to_string().contains(says), "{extra:?}: {error}");
         }
     }

@@ -1,39 +1,41 @@
 //! `splatvk train`
 use super::args::TrainArgs;
 use super::kept::tell_of_kept_stages;
-use super::plan;
 use super::print::{ending, print, print_json};
 use super::progress;
-use crate::Result;
-use crate::run::train::{TrainPlan, train as run};
+use crate::run::sources::SourceChoice;
+use crate::run::{self, GeometryConfig, Inputs, ReconstructionConfig, RunPlan};
+use crate::{Error, Result};
 use serde_json::json;
 
 pub fn train(args: &TrainArgs) -> Result<()> {
-    let plan = TrainPlan {
-        images: args.images.clone(),
-        cameras: args.cameras.clone(),
-        views: args.views,
-        points: args.points.clone(),
-        out: args.out.clone(),
-        force: args.making.force,
-        photo_masks: args.making.photo_masks.clone(),
-        resume: args.making.resume,
-        checkpoint_seconds: args.making.checkpoint_seconds,
-        preset: args.making.preset.map(plan::preset),
-        iterations: args.making.iterations,
-        sh_degree: args.making.sh_degree,
-        seed: args.making.seed,
-        max_size: args.making.max_size,
-        device: args.device.device.clone(),
-        deterministic: args.making.deterministic,
-        models: args.device.models.clone(),
-        provider: args.device.provider.clone(),
+    let cameras = SourceChoice::with("cameras", &args.cameras);
+    let config = ReconstructionConfig {
+        geometry: GeometryConfig { init: cameras, ..GeometryConfig::default() },
+        training: args.training.clone(),
+        language: None,
+    };
+    let plan = RunPlan {
+        inputs: Inputs {
+            photos: vec![args.images.clone()],
+            views: args.views,
+            photo_masks: args.saving.photo_masks.clone(),
+            points: args.points.clone(),
+            ..Inputs::default()
+        },
+        config,
+        machine: args.device.machine(),
+        output: args.saving.destination(args.out.clone()),
     };
     let progress = progress::reporter();
-    let trained = run(&plan, progress.as_ref())?;
+    let outcome = run::run(&plan, progress.as_ref())?;
     match args.device.json {
-        true => print_json(&json!({ "out": plan.out, "run": trained.record }))?,
-        false => print(&(trained.table + &ending(&plan.out)))?,
+        true => {
+            let record = serde_json::to_value(run::run_record(&outcome));
+            let record = record.map_err(|e| Error::work(format!("run record: {e}")))?;
+            print_json(&json!({ "out": plan.output.out, "run": record }))?;
+        }
+        false => print(&(run::closing_table(&outcome) + &ending(&plan.output.out)))?,
     }
     tell_of_kept_stages(progress.as_ref());
     Ok(())

@@ -1,71 +1,93 @@
-//! Contents of run.json and the report.
+//! Contents of `run.json` and of the report.
 use super::bare::bare;
 use super::viewer;
-use crate::Result;
 use crate::photo::Light;
 use crate::progress::StageRecord;
 use crate::scene::{Image, RgbImage};
-use serde::Serialize;
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::Path;
 
-/// A model file that a run used.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+/// Model file of a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ModelUsed {
     /// Model name.
     pub name: String,
-    /// Of the file.
+    /// SHA-256 of the file.
     pub sha256: String,
     /// SPDX expression.
     pub licence: String,
 }
 
-/// The content of `run.json`.
-#[derive(Clone, Debug, Serialize)]
-pub struct RunRecord {
+/// Content of `run.json`, with typed configuration and statistics or with plain JSON.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct RunRecord<Config = Value, Statistics = Value> {
     /// "splatvk 0.1.0".
     pub program: String,
     /// Options after defaults were resolved.
-    pub config: Value,
+    pub config: Config,
     /// Seed of everything random.
     pub seed: u64,
     /// Name of the Vulkan device.
     pub device: String,
-    /// The device computes on the CPU.
+    /// Whether the device computes on the CPU.
     pub device_is_cpu: bool,
-    /// Model files that were used.
+    /// Model files of the run.
     pub models: Vec<ModelUsed>,
     /// Stages in order.
     pub stages: Vec<StageRecord>,
     /// Wall seconds of the run.
     pub seconds: f64,
-    /// Splats, PSNR, match counts, codes per level: free-form.
-    pub statistics: Value,
-    /// What the user was warned about.
+    /// Splats, PSNR, match counts, codes per level.
+    pub statistics: Statistics,
+    /// Warnings of the run.
     pub warnings: Vec<String>,
 }
 
-impl RunRecord {
-    /// The same without the folders of the paths that the user typed: a scene and its report are
-    /// passed on, and nobody there needs to know where the photos lay.
-    pub fn without_folders<'a>(mut self, typed: impl IntoIterator<Item = &'a Path>) -> RunRecord {
-        let mut warnings = Value::from(std::mem::take(&mut self.warnings));
+impl<Config: Serialize, Statistics: Serialize> RunRecord<Config, Statistics> {
+    /// Record as JSON without the folders of the paths that the user typed, since scenes and
+    /// reports are shared.
+    ///
+    /// # Errors
+    /// Values that JSON does not hold.
+    pub fn without_folders<'a>(self, typed: impl IntoIterator<Item = &'a Path>) -> Result<RunRecord> {
         let typed: Vec<&Path> = typed.into_iter().collect();
-        for value in [&mut self.config, &mut self.statistics, &mut warnings] {
+        let json =
+            |value: serde_json::Result<Value>| value.map_err(|e| Error::work(format!("run.json: {e}")));
+        let mut warnings = Value::from(self.warnings);
+        let mut config = json(serde_json::to_value(self.config))?;
+        let mut statistics = json(serde_json::to_value(self.statistics))?;
+        for value in [&mut config, &mut statistics, &mut warnings] {
             bare(value, typed.iter().copied());
         }
         let texts = warnings.as_array().into_iter().flatten();
-        self.warnings = texts.filter_map(|w| w.as_str().map(str::to_owned)).collect();
-        self
+        let warnings = texts.filter_map(|w| w.as_str().map(str::to_owned)).collect();
+        let RunRecord { program, seed, device, device_is_cpu, models, stages, seconds, .. } = self;
+        Ok(RunRecord {
+            program,
+            config,
+            seed,
+            device,
+            device_is_cpu,
+            models,
+            stages,
+            seconds,
+            statistics,
+            warnings,
+        })
     }
+}
 
+impl RunRecord {
     /// Writes `run.json` into a scene folder.
     pub fn write(&self, folder: &Path) -> Result<()> {
         crate::format::write_json(&folder.join("run.json"), self)
     }
 }
 
-/// One training view in the report; maps have the size of the photo or are left out.
+/// Training view in the report; maps have the size of the photo or are absent.
 #[derive(Clone, Copy, Debug)]
 pub struct ViewShown<'a> {
     /// Name under the pictures, also the stem of preview files.
@@ -80,11 +102,11 @@ pub struct ViewShown<'a> {
     pub levels: &'a [(&'a str, Image<i32>)],
     /// PSNR of the render, dB.
     pub psnr: Option<f64>,
-    /// What was taken out of the photo.
+    /// Light that was corrected in the photo.
     pub light: Light,
 }
 
-/// The answer to one text in one view.
+/// Answer to one query in one view.
 #[derive(Clone, Copy, Debug)]
 pub struct AnswerShown<'a> {
     /// Index into the views.
@@ -95,35 +117,35 @@ pub struct AnswerShown<'a> {
     pub mask: Option<&'a Image<bool>>,
     /// Best relevancy.
     pub score: f32,
-    /// Reached the threshold.
+    /// Whether the score reached the threshold.
     pub found: bool,
     /// Name of the level that answered.
     pub level: &'a str,
 }
 
-/// A query and its answers.
+/// Query with its answers.
 #[derive(Clone, Debug)]
 pub struct QueryShown<'a> {
-    /// The text of the query.
+    /// Text of the query.
     pub text: &'a str,
-    /// The answer in a few words.
+    /// Answer in a few words.
     pub verdict: String,
     /// One per view.
     pub answers: Vec<AnswerShown<'a>>,
 }
 
-/// A figure over the optimisation steps of a stage.
+/// Figure over the optimisation steps of a stage.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Curve {
-    /// What is measured.
+    /// Measured quantity.
     pub name: &'static str,
-    /// dB, %, or nothing.
+    /// dB, % or empty.
     pub unit: &'static str,
     /// (step, value).
     pub points: Vec<(f64, f64)>,
 }
 
-/// Everything that `report.html` and `previews/` show.
+/// Contents of `report.html` and `previews/`.
 #[derive(Clone, Debug)]
 pub struct HtmlReport<'a> {
     /// Headline, usually the name of the photo folder.
@@ -132,11 +154,11 @@ pub struct HtmlReport<'a> {
     pub views: Vec<ViewShown<'a>>,
     /// Queries of the run.
     pub queries: Vec<QueryShown<'a>>,
-    /// How training went.
+    /// Training curves.
     pub curves: Vec<Curve>,
-    /// Embedding space of the language field; `words/…` gets a plain statement of what it covers.
+    /// Embedding space of the language field; for `words/…` the page explains its limits.
     pub space: Option<&'a str>,
-    /// The scene for the interactive view.
+    /// Scene for the interactive view.
     pub scene: Option<viewer::Scene3d<'a>>,
     /// Figures for the head of the page: (label, value).
     pub figures: Vec<(String, String)>,

@@ -181,7 +181,7 @@ impl Prepared {
         let codes: Vec<&[Image<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
         let mut views = query::answer_all(&codes, field, query, options)?;
         for view in views.iter_mut().filter(|v| presence == Some(Presence::Absent) || !v.found) {
-            view.take_back();
+            view.mark_not_found();
         }
         let selection = self.select(field, query, presence, options)?;
         let mut instances = match selection.found {

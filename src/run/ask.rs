@@ -21,12 +21,12 @@ fn as_query(
     verbatim: bool,
 ) -> Result<TextQuery> {
     phrasing::check(text)?;
-    let phrasing = if verbatim || encoder.holds(text) { None } else { phrasing::read(text) };
+    let phrasing = if verbatim || encoder.has_table_entry(text) { None } else { phrasing::read(text) };
     let asked = phrasing.as_ref().map_or(text, |p| &p.answers_for).to_owned();
     let embedding = encoder.embed_texts(&[&asked])?;
-    let things = others.of(&things::form(&asked), |form| encoder.others(form))?.things.clone();
-    let alternatives = Alternatives { things, colours: encoder.recoloured(&asked)? };
-    let vocabulary = encoder.nearest_word(&asked)?.map(|(known, nearest)| Vocabulary { known, nearest });
+    let things = others.of(&things::form(&asked), |form| encoder.embed_other_things(form))?.things.clone();
+    let alternatives = Alternatives { things, colours: encoder.embed_recoloured(&asked)? };
+    let vocabulary = encoder.find_nearest_word(&asked)?.map(|(known, nearest)| Vocabulary { known, nearest });
     let reading = Reading { phrasing, vocabulary };
     Ok(TextQuery { text: text.to_owned(), embedding, canonicals: canonicals.to_vec(), alternatives, reading })
 }
@@ -123,7 +123,7 @@ impl Questions {
         let query = self.query(text)?;
         self.look(viewer, field, views)?;
         let asked = query.reading.phrasing.as_ref().map_or(text, |p| &p.answers_for);
-        let shared = self.others.of(&things::form(asked), |form| self.encoder.others(form))?;
+        let shared = self.others.of(&things::form(asked), |form| self.encoder.embed_other_things(form))?;
         self.prepared.answer(field, views, &query, options, &mut shared.background)
     }
 }
@@ -176,7 +176,7 @@ impl QueryScene {
         Ok(&self.frames)
     }
 
-    /// The phrases of the text model that name each code best: see [`RegionEncoder::names`].
+    /// The phrases of the text model that name each code best: see [`RegionEncoder::name_regions`].
     pub fn names(&mut self) -> Result<CodeNames> {
         names(self.questions.encoder.as_mut(), &self.field, NAMES)
     }
@@ -213,7 +213,7 @@ pub fn names(encoder: &mut dyn RegionEncoder, field: &LanguageField, best: usize
     for level in &field.levels {
         let book = &level.codebook;
         let rows = book.embeddings.chunks_exact(book.embedding_dim.max(1));
-        let named = encoder.names(&book.embeddings, best)?;
+        let named = encoder.name_regions(&book.embeddings, best)?;
         let rate = |(row, list): (&[f32], Vec<(String, f32)>)| {
             list.into_iter()
                 .map(|(name, cosine)| (name, query::relevancy(row, cosine.into(), &canonicals)))

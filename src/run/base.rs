@@ -1,117 +1,32 @@
 //! A scene that more photos are added to: what it is, and what it was made with.
-use super::method::Method;
+use super::record::{self, RunRecord};
 use crate::files;
-use crate::fit::Preset;
 use crate::format::{colmap, scene_dir, scene_photos};
 use crate::photo::{self, Photo};
-use crate::pose::{Fitted, KnownPhotos};
+use crate::pose::KnownPhotos;
 use crate::progress::Progress;
-use crate::scene::{Camera, LanguageField, Lens, PointCloud, Seen, Splats, World};
+use crate::scene::{Camera, LanguageField, PointCloud, Seen, Splats, World};
 use crate::{Error, Result};
-use serde_json::Value;
 use std::path::Path;
 
-/// What a scene was made with, by its run.json.
-#[derive(Clone, Debug)]
-pub struct Settings {
-    file: String,
-    record: Value,
-}
+/// What `--add` takes, for errors.
+const ADDABLE: &str = "--add takes a scene that splatvk run wrote";
 
-impl Settings {
-    /// Reads run.json of a scene directory.
-    pub fn read(scene: &Path) -> Result<Settings> {
-        let path = scene.join("run.json");
-        let file = path.display().to_string();
-        let bad = |what: String| {
-            Error::input(format!("{file}: {what}; --add takes a scene that splatvk run wrote"))
-        };
-        if !path.is_file() {
-            return Err(bad("missing".to_owned()));
-        }
-        let record: Value = files::read_json(&path, "--add takes a scene that splatvk run wrote")?;
-        let settings = Settings { file, record };
-        match settings.text("method") {
-            Some("sparselgs" | "lift") => Ok(settings),
-            Some(method) => Err(Error::input(format!(
-                "{}: made with --method {method}; photos can be added to scenes of --method sparselgs or lift",
-                settings.file
-            ))),
-            None => Err(Error::input(format!(
-                "{}: the scene has no language; --add takes a scene that splatvk run wrote, for splatvk train give all photos at once",
-                settings.file
-            ))),
-        }
-    }
-
-    fn plan(&self, name: &str) -> &Value {
-        &self.record["config"]["plan"][name]
-    }
-
-    fn text(&self, name: &str) -> Option<&str> {
-        self.plan(name).as_str()
-    }
-
-    /// The source that `--option` was resolved to.
-    pub fn source(&self, option: &str) -> Option<&str> {
-        self.text(option)
-    }
-
-    /// The method that the scene was made with.
-    pub fn method(&self) -> Result<&'static Method> {
-        Method::named(self.text("method").unwrap_or_default())
-    }
-
-    /// The preset that was used.
-    pub fn preset(&self) -> Option<Preset> {
-        serde_json::from_value(self.record["config"]["preset"].clone()).ok()
-    }
-
-    /// Length of the codes.
-    pub fn feature_dim(&self) -> Option<usize> {
-        usize::try_from(self.plan("feature_dim").as_u64()?).ok()
-    }
-
-    /// Whether every level has a model of its own.
-    pub fn per_level(&self) -> bool {
-        self.plan("per_level").as_bool().unwrap_or(false)
-    }
-
-    /// `--compat` of the run.
-    pub fn compat(&self) -> Option<&str> {
-        self.text("compat")
-    }
-
-    /// Queries that were asked, then `more` that are new.
-    pub fn queries(&self, more: &[String]) -> Vec<String> {
-        let old = self.plan("queries").as_array().into_iter().flatten();
-        let mut all: Vec<String> = old.filter_map(|q| Some(q.as_str()?.to_owned())).collect();
-        for query in more {
-            if !all.contains(query) {
-                all.push(query.clone());
-            }
-        }
-        all
-    }
-
-    /// How the camera of a photo was found; where that was not estimated, cameras were given and
-    /// stand.
-    fn fitted(&self, stem: &str) -> Fitted {
-        let list = self.record["statistics"]["geometry"]["optics"].as_array();
-        let own = list.into_iter().flatten().find(|o| o["photo"].as_str() == Some(stem));
-        let Some(own) = own else { return Fitted { agreement: 1.0, ..Fitted::default() } };
-        let number = |value: &Value| value.as_f64().unwrap_or(0.0);
-        let sigma = |name: &str| number(&own["sigma"][name]);
-        Fitted {
-            lens: Lens::radial(number(&own["k1"]), number(&own["k2"])),
-            sigmas: ["log_focal", "k1", "k2", "cx", "cy"].map(sigma),
-            residual: number(&own["residual_px"]),
-            agreement: number(&own["agreement"]),
-            // What else makes a place doubtful is not recorded by itself.
-            unconfirmed: own["confidence"] == "low",
-            rotation_sigma: number(&own["rotation_sigma_degrees"]).to_radians(),
-            camera: own["camera"].as_u64().and_then(|c| usize::try_from(c).ok()).unwrap_or(0),
-        }
+/// The record of a scene that photos can be added to.
+pub fn record_of(scene: &Path) -> Result<RunRecord> {
+    let record = record::read(scene, ADDABLE)?;
+    let file = scene.join("run.json");
+    let plan = &record.config.plan.config;
+    match plan.language.as_ref().and_then(|l| l.method).map(|m| m.name) {
+        Some("sparselgs" | "lift") => Ok(record),
+        Some(method) => Err(Error::input(format!(
+            "{}: made with --method {method}; photos can be added to scenes of --method sparselgs or lift",
+            file.display()
+        ))),
+        None => Err(Error::input(format!(
+            "{}: the scene has no language; {ADDABLE}, for splatvk train give all photos at once",
+            file.display()
+        ))),
     }
 }
 
@@ -137,7 +52,7 @@ pub struct BaseScene {
 impl BaseScene {
     /// Reads a scene directory that `splatvk run` wrote.
     pub fn open(path: &Path) -> Result<BaseScene> {
-        let settings = Settings::read(path)?;
+        let record = record_of(path)?;
         let photos = scene_photos::load(path)?;
         let scene = scene_dir::load(path)?;
         let field = scene.language.ok_or_else(|| {
@@ -157,7 +72,7 @@ impl BaseScene {
             Camera { name, ..camera }
         };
         let cameras = scene.cameras.into_iter().zip(&photos).map(named).collect();
-        let fitted = photos.iter().map(|p| settings.fitted(&p.stem)).collect();
+        let fitted = photos.iter().map(|p| record.fitted(&p.stem)).collect();
         let points = colmap::read_points(&path.join("cameras/colmap"))?;
         Ok(BaseScene {
             identity: identity(path)?,
@@ -247,6 +162,7 @@ fn identity(path: &Path) -> Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::Lens;
 
     #[test]
     fn photos_of_the_scene_are_known_again() {

@@ -6,7 +6,7 @@ use crate::language::Reducer;
 use crate::language::align::{AlignOptions, AreaScore};
 use crate::query::{MaskRule, QueryOptions};
 use crate::{Error, Result, files};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::io::ErrorKind;
 use std::path::Path;
@@ -33,6 +33,14 @@ pub struct Compat {
 impl Serialize for Compat {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
         serializer.serialize_str(self.name)
+    }
+}
+
+impl<'de> Deserialize<'de> for &'static Compat {
+    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> std::result::Result<Self, D::Error> {
+        let name = String::deserialize(from)?;
+        let found = Compat::named(&name).map_err(serde::de::Error::custom)?;
+        found.ok_or_else(|| serde::de::Error::custom("no compat is null"))
     }
 }
 

@@ -27,12 +27,19 @@ use std::path::Path;
 ///
 /// ```no_run
 /// # fn main() -> splatvk::Result<()> {
-/// use splatvk::{gpu, infer::Registry, photo, pose::choose, progress::Silent, run::{self, RunPlan, live::LiveScene}};
+/// use splatvk::{gpu, infer::Registry, photo, pose::choose, progress::Silent, run::{self, Extras, ReconstructionConfig, live::LiveScene}};
 /// let device = gpu::open(None)?;
 /// let (chosen, _) = choose::photos(&["my-photos".into()], Some(4), &Silent)?;
 /// let photos = photo::load_each(&chosen, photo::MAX_SIZE, &Silent)?;
 /// let models = Registry::open(None)?;
-/// let outcome = run::reconstruct(&RunPlan::default(), &device, &models, photos, &Silent)?;
+/// let outcome = run::reconstruct(
+///     &ReconstructionConfig::default(),
+///     &Extras::default(),
+///     &device,
+///     &models,
+///     photos,
+///     &Silent,
+/// )?;
 /// let mut scene = LiveScene::trained(&device, outcome, &models)?;
 /// let camera = scene.cameras()[0].clone();
 /// let answer = scene.ask("blue mug", &camera)?;
@@ -72,11 +79,11 @@ impl LiveScene {
 
     fn new(device: &Device, origin: SceneOrigin, registry: &Registry) -> Result<LiveScene> {
         let (splats, field) = match &origin {
-            SceneOrigin::Trained(o) => (&o.splats, Some(&o.field)),
+            SceneOrigin::Trained(o) => (&o.splats, o.language.as_ref().map(|l| &l.field)),
             SceneOrigin::Loaded(s) => (&s.splats, s.language.as_ref()),
         };
         let compat = match &origin {
-            SceneOrigin::Trained(o) => o.plan.compat,
+            SceneOrigin::Trained(o) => o.plan.config.language.as_ref().and_then(|l| l.compat),
             SceneOrigin::Loaded(s) if s.language.is_some() => Compat::of_scene(&s.path)?,
             SceneOrigin::Loaded(_) => None,
         };
@@ -120,7 +127,7 @@ impl LiveScene {
     /// Codebooks and features, where the scene has language.
     pub fn language(&self) -> Option<&LanguageField> {
         match &self.origin {
-            SceneOrigin::Trained(o) => Some(&o.field),
+            SceneOrigin::Trained(o) => o.language.as_ref().map(|l| &l.field),
             SceneOrigin::Loaded(s) => s.language.as_ref(),
         }
     }
@@ -197,10 +204,10 @@ impl LiveScene {
         };
         // Taken apart, since the viewer is used while the field is read.
         let field = match &self.origin {
-            SceneOrigin::Trained(o) => Some(&o.field),
+            SceneOrigin::Trained(o) => o.language.as_ref().map(|l| &l.field),
             SceneOrigin::Loaded(s) => s.language.as_ref(),
         };
-        let field = field.ok_or_else(|| Error::work("the scene has no language"))?;
+        let field = field.ok_or_else(no_language)?;
         let views = (std::slice::from_ref(&camera), std::slice::from_ref(&frame));
         let answers = questions.ask(text, &mut self.viewer, field, views, &self.options);
         self.seen = Some((camera, frame));
@@ -209,10 +216,13 @@ impl LiveScene {
 
     fn open_questions(&self) -> Result<Questions> {
         let encoder = match &self.origin {
-            SceneOrigin::Trained(o) => sources::encoder(&o.plan.features, &self.registry)?,
+            SceneOrigin::Trained(o) => {
+                let config = o.plan.config.language.as_ref().ok_or_else(no_language)?;
+                sources::encoder(&config.features, &self.registry)?
+            }
             SceneOrigin::Loaded(s) => encoder::of_scene(s, self.registry.clone())?,
         };
-        let field = self.language().ok_or_else(|| Error::work("the scene has no language"))?;
+        let field = self.language().ok_or_else(no_language)?;
         Questions::open(encoder, self.splats(), field, self.cameras())
     }
 
@@ -254,6 +264,10 @@ impl LiveScene {
             SceneOrigin::Trained(_) => Ok(()),
         }
     }
+}
+
+fn no_language() -> Error {
+    Error::work("the scene has no language")
 }
 
 fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {

@@ -9,7 +9,7 @@ use crate::language::{BuildOptions, Reducer};
 use crate::progress::Progress;
 use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// A method of the paper's comparison. All start from dense points of the photos, as the paper's
 /// "-s" rows.
@@ -26,6 +26,12 @@ pub struct Method {
 impl Serialize for Method {
     fn serialize<S: serde::Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
         serializer.serialize_str(self.name)
+    }
+}
+
+impl<'de> Deserialize<'de> for &'static Method {
+    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> std::result::Result<Self, D::Error> {
+        Method::named(&String::deserialize(from)?).map_err(serde::de::Error::custom)
     }
 }
 
@@ -266,7 +272,7 @@ fn train_index_heads(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::RunPlan;
+    use crate::run::LanguageConfig;
 
     #[test]
     fn features_are_trained_by_default_where_something_of_the_training_is_asked_for() {
@@ -276,11 +282,10 @@ mod tests {
         assert_eq!(name(Some(Preset::Paper), None, false), "sparselgs");
         assert_eq!(name(None, Some(30), false), "sparselgs");
         assert_eq!(name(None, None, true), "sparselgs");
-        let plan = RunPlan { preset: Some(Preset::Paper), ..RunPlan::default() };
         assert_eq!(
-            plan.recipe().language,
+            LanguageConfig::default().recipe(Some(Preset::Paper)).language,
             LanguageFit::Train,
-            "a plan that names no method follows its preset"
+            "a configuration that names no method follows its preset"
         );
     }
 

@@ -5,33 +5,40 @@ pub mod base;
 mod border;
 pub mod budget;
 pub mod compat;
+pub mod config;
 pub mod encoder;
 mod execute;
 mod fidelity;
+mod graph;
 mod light;
-mod list;
 pub mod live;
 pub mod method;
 pub mod metric;
 mod networks;
 mod outcome;
+mod photos;
 mod plan;
+mod points;
 mod recent;
-mod record;
+pub mod record;
 pub mod refine;
 pub mod score;
 pub mod sources;
 pub mod stages;
-pub mod train;
+mod summary;
 pub mod view;
+#[cfg(feature = "cli")]
+pub(crate) mod whole;
 
 pub use answer::Answers;
 pub use compat::Compat;
+pub use config::{GeometryConfig, LanguageConfig, ReconstructionConfig, TrainingConfig};
 pub use execute::{reconstruct, run, save, stage_folder};
 pub use method::{FEATURE_DIM, Method, Recipe};
 pub use outcome::RunOutcome;
-pub use plan::{CHECKPOINT_SECONDS, RunPlan};
-pub use record::{closing_table, run_record};
+pub use plan::{CHECKPOINT_SECONDS, Destination, Extras, Inputs, Machine, RunPlan};
+pub use record::{RunRecord, run_record};
+pub use summary::closing_table;
 
 #[cfg(test)]
 mod defaults_tests;

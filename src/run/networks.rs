@@ -1,5 +1,5 @@
 //! The networks that users bring, as a run uses them: found before any work, named in run.json.
-use super::plan::RunPlan;
+use super::config::ReconstructionConfig;
 use super::sources::{DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, installed};
 use crate::Result;
 use crate::infer::Registry;
@@ -7,19 +7,22 @@ use crate::infer::installed::{HashedFile, Installed};
 use crate::progress::Progress;
 use crate::report::ModelUsed;
 
-/// The networks of a plan.
+/// The networks of a configuration.
 pub(super) struct Networks(Vec<Installed>);
 
 impl Networks {
     /// Finds them all before any work; the error says what is missing.
-    pub(super) fn of(plan: &RunPlan, registry: &Registry) -> Result<Networks> {
-        let found = [
-            installed::<GeometrySources>(&plan.init, registry)?,
-            installed::<DepthSources>(&plan.depth_prior, registry)?,
-            installed::<MatchSources>(&plan.matcher, registry)?,
-            installed::<MaskSources>(&plan.masks, registry)?,
-            installed::<FeatureSources>(&plan.features, registry)?,
+    pub(super) fn of(config: &ReconstructionConfig, registry: &Registry) -> Result<Networks> {
+        let geometry = &config.geometry;
+        let mut found = vec![
+            installed::<GeometrySources>(&geometry.init, registry)?,
+            installed::<DepthSources>(&geometry.depth_prior, registry)?,
         ];
+        if let Some(language) = &config.language {
+            found.push(installed::<MatchSources>(&language.matcher, registry)?);
+            found.push(installed::<MaskSources>(&language.masks, registry)?);
+            found.push(installed::<FeatureSources>(&language.features, registry)?);
+        }
         Ok(Networks(found.into_iter().flatten().collect()))
     }
 

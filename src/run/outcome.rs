@@ -45,18 +45,10 @@ pub struct RunOutcome {
     pub rgb: fit::FitStats,
     /// PSNR of the finished scene against every photo, dB.
     pub psnr: Vec<f64>,
-    /// The scene's language.
-    pub field: LanguageField,
-    /// Masks, edges and components behind it.
-    pub alignment: language::align::Alignment,
-    /// Decode accuracy over the language stage.
-    pub language_curve: Vec<fit::LanguagePoint>,
     /// The trained scene seen from every photo's camera.
     pub frames: Vec<DecodedFrame>,
-    /// One per query of the plan.
-    pub answers: Vec<Answers>,
-    /// The text model's own phrases per level and code.
-    pub names: CodeNames,
+    /// The scene's language; `None` for a scene of colours alone.
+    pub language: Option<LanguageOutcome>,
     /// What computed the networks.
     pub provider: Option<&'static str>,
     /// Built-in models.
@@ -69,4 +61,19 @@ pub struct RunOutcome {
     pub seconds: f64,
     /// What the user was warned of.
     pub warnings: Vec<String>,
+}
+
+/// The language of a finished run.
+#[non_exhaustive]
+pub struct LanguageOutcome {
+    /// Codes and features.
+    pub field: LanguageField,
+    /// Masks, edges and components behind it.
+    pub alignment: language::align::Alignment,
+    /// Decode accuracy over the language stage.
+    pub curve: Vec<fit::LanguagePoint>,
+    /// One per query of the plan.
+    pub answers: Vec<Answers>,
+    /// The text model's own phrases per level and code.
+    pub names: CodeNames,
 }

@@ -1,210 +1,200 @@
-//! What to run, and what follows from it for the stages.
+//! A run: its inputs, configuration, machine and output, and the options of its stages.
 use super::budget;
-use super::compat::Compat;
-use super::method::{FEATURE_DIM, Method, Recipe};
-use super::sources::{self, SourceChoice};
-use crate::Result;
+use super::config::ReconstructionConfig;
+use super::sources::SourceChoice;
 use crate::fit::{LanguageOptions, Preset, RgbOptions, ViewDependentOptions};
-use crate::gpu::Device;
+use crate::gpu::{self, Device};
 use crate::infer::{Compute, Registry};
-use crate::language::sam::SamOptions;
+use crate::query::phrasing;
 use crate::scene::GivenCamera;
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
 /// Training states are some ten megabytes for scenes of a few photos: written in a fraction of a
 /// second.
 pub const CHECKPOINT_SECONDS: u64 = 30;
 
-/// What to do, with every default that does not depend on the machine resolved.
-#[derive(Clone, Debug, serde::Serialize)]
+/// A run from files to a scene directory.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
 pub struct RunPlan {
-    /// Photos or folders of photos.
-    pub inputs: Vec<PathBuf>,
+    /// Files that the run reads, and questions.
+    #[serde(flatten)]
+    pub inputs: Inputs,
+    /// Settings that change the result.
+    #[serde(flatten)]
+    pub config: ReconstructionConfig,
+    /// Device, models and providers.
+    #[serde(flatten)]
+    pub machine: Machine,
+    /// Place of the scene.
+    #[serde(flatten)]
+    pub output: Destination,
+}
+
+/// Files that a run reads, and questions.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Inputs {
+    /// Photos, folders of photos, or a video.
+    #[serde(rename = "inputs")]
+    pub photos: Vec<PathBuf>,
     /// A scene directory that the photos join, instead of making a scene of their own.
     pub add: Option<PathBuf>,
-    /// How many to use; `None` = as many as there are, at most [`photo::DEFAULT_VIEWS`].
+    /// Number of photos to use; `None`: all, at most [`crate::photo::DEFAULT_VIEWS`], or
+    /// [`crate::photo::MAX_VIEWS`] for a scene without language.
     pub views: Option<usize>,
-    /// Scene directory.
-    pub out: PathBuf,
     /// Folder of a mask per photo; `None` = one beside the photos, where there is any.
     pub photo_masks: Option<PathBuf>,
+    /// Points to start from (`.ply`, a COLMAP model folder or a data set that holds one), in the
+    /// frame of the cameras of `init`, instead of those of stereo.
+    pub points: Option<PathBuf>,
+    /// Texts to answer once the scene is there.
+    pub queries: Vec<String>,
+}
+
+/// Inputs beside the photos of [`super::reconstruct`].
+#[derive(Clone, Debug, Default)]
+pub struct Extras {
+    /// Known cameras, one per photo with its name, instead of those of `init`.
+    pub cameras: Vec<GivenCamera>,
+    /// Texts to answer.
+    pub queries: Vec<String>,
+}
+
+/// Device, models and providers.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Machine {
+    /// Vulkan device: part of its name, or its number.
+    pub device: Option<String>,
+    /// Folder of the models.
+    pub models: Option<PathBuf>,
+    /// Execution provider of the networks, one of [`crate::infer::provider::NAMES`]; `None` = see
+    /// [`Compute::by`].
+    pub provider: Option<String>,
+}
+
+/// Place of the scene, and use of stages that an earlier run left.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Destination {
+    /// Scene directory.
+    pub out: PathBuf,
     /// Replace an existing scene.
     pub force: bool,
     /// Use the stages that an earlier run with the same photos and settings has finished.
     pub resume: bool,
     /// Seconds between states of training on disk.
     pub checkpoint_seconds: u64,
-    /// `None` = draft on a CPU device, default elsewhere.
-    pub preset: Option<Preset>,
-    /// Cameras and points.
-    pub init: SourceChoice,
-    /// Depth suggested where stereo finds none.
-    pub depth_prior: SourceChoice,
-    /// Known cameras in memory, one per photo with its name, instead of those of `init`.
-    #[serde(skip)]
-    pub cameras: Vec<GivenCamera>,
-    /// Dense matches.
-    pub matcher: SourceChoice,
-    /// Masks.
-    pub masks: SourceChoice,
-    /// Prompts of a mask network.
-    pub sam: SamOptions,
-    /// Features.
-    pub features: SourceChoice,
-    /// Texts to answer once the scene is there.
-    pub queries: Vec<String>,
-    /// Seed of everything random.
-    pub seed: u64,
-    /// Steps of the colour stage instead of the preset's.
-    pub iterations: Option<usize>,
-    /// Steps of the language stage instead of the preset's.
-    pub language_iterations: Option<usize>,
-    /// SH degree of the colours, 0–3; `None` = what the photos support, and 0 in the paper's
-    /// preset.
-    pub sh_degree: Option<u32>,
-    /// What gets language onto the splats; `None` = [`Method::by_default`].
-    pub method: Option<&'static Method>,
-    /// Length of the codes.
-    pub feature_dim: usize,
-    /// One model per level.
-    pub per_level: bool,
-    /// What is done as others do it; masks, code length and models of it stand in their own fields.
-    pub compat: Option<&'static Compat>,
-    /// Greatest side of the working images, pixels; `None` = [`photo::default_max_size`] of the
-    /// device.
-    pub max_size: Option<usize>,
-    /// Vulkan device.
-    pub device: Option<String>,
-    /// The same bits on every run: see [`crate::gpu::Options`].
-    pub deterministic: bool,
-    /// Folder of the models.
-    pub models: Option<PathBuf>,
-    /// What computes the networks, one of [`crate::infer::provider::NAMES`]; `None` = see
-    /// [`Compute::by`].
-    pub provider: Option<String>,
 }
 
-impl Default for RunPlan {
-    /// Built-in models, everything else as the device suggests; no inputs, and nowhere to write.
+impl Default for Destination {
     fn default() -> Self {
-        RunPlan {
-            inputs: Vec::new(),
-            add: None,
-            views: None,
+        Destination {
             out: PathBuf::new(),
-            photo_masks: None,
             force: false,
             resume: false,
             checkpoint_seconds: CHECKPOINT_SECONDS,
-            preset: None,
-            init: sources::default::<sources::GeometrySources>(),
-            depth_prior: sources::default::<sources::DepthSources>(),
-            cameras: Vec::new(),
-            matcher: sources::default::<sources::MatchSources>(),
-            masks: sources::default::<sources::MaskSources>(),
-            sam: SamOptions::default(),
-            features: sources::default::<sources::FeatureSources>(),
-            queries: Vec::new(),
-            seed: 0,
-            iterations: None,
-            language_iterations: None,
-            sh_degree: None,
-            method: None,
-            feature_dim: FEATURE_DIM,
-            per_level: false,
-            compat: None,
-            max_size: None,
-            device: None,
-            deterministic: false,
-            models: None,
-            provider: None,
         }
     }
 }
 
-impl RunPlan {
-    /// The plan with what a `compat` decides beside the length of the codes
-    /// ([`super::compat::feature_dim`]).
-    pub fn compatible(self, compat: Option<&'static Compat>) -> RunPlan {
-        RunPlan {
-            per_level: self.per_level || compat.is_some_and(|c| c.per_level),
-            sam: SamOptions { paint_in_order: compat.is_some_and(|c| c.paint_in_order), ..self.sam },
-            compat,
-            ..self
-        }
+impl Inputs {
+    /// Refuses questions that cannot be asked.
+    pub fn check(&self) -> Result<()> {
+        self.queries
+            .iter()
+            .try_for_each(|text| phrasing::check(text).map_err(|e| Error::input(format!("--query: {e}"))))
     }
+}
 
-    /// The files and folders that the run reads.
-    pub fn read(&self) -> impl Iterator<Item = &Path> {
-        let sources = [&self.init, &self.depth_prior, &self.matcher, &self.masks, &self.features];
-        let arguments = sources.into_iter().filter_map(|s| s.argument.as_deref());
-        let folders = [&self.add, &self.models, &self.photo_masks].into_iter().flatten();
-        self.inputs.iter().map(PathBuf::as_path).chain(arguments).chain(folders.map(PathBuf::as_path))
-    }
-
-    /// The method that is asked for, or else the one that suits the plan.
-    pub fn method(&self) -> &'static Method {
-        let suiting = || Method::by_default(self.preset, self.language_iterations, self.per_level);
-        self.method.unwrap_or_else(suiting)
-    }
-
-    /// What the method does, with the plan's code length.
-    pub fn recipe(&self) -> Recipe {
-        let recipe = self.method().recipe;
-        let align = self.compat.map_or(recipe.align, |c| c.align);
-        Recipe { feature_dim: self.feature_dim, align, ..recipe }
-    }
-
-    /// The models that the plan names.
+impl Machine {
+    /// The installed models.
     pub fn registry(&self) -> Result<Registry> {
         Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref()))
     }
 
+    pub(super) fn open(&self, deterministic: bool) -> Result<Device> {
+        Ok(Device::open(&gpu::Options { deterministic, ..gpu::options(self.device.as_deref()) })?)
+    }
+}
+
+impl RunPlan {
+    /// The files and folders that the run reads.
+    pub fn read(&self) -> impl Iterator<Item = &Path> {
+        let Inputs { photos, add, photo_masks, points, .. } = &self.inputs;
+        let folders = [add, photo_masks, points, &self.machine.models].into_iter().flatten();
+        let arguments = self.config.sources().filter_map(|s: &SourceChoice| s.argument.as_ref());
+        photos.iter().chain(arguments).chain(folders).map(PathBuf::as_path)
+    }
+}
+
+/// Options of the stages on a device.
+impl ReconstructionConfig {
     /// The preset, or the device's.
     pub(super) fn preset_on(&self, device: &Device) -> Preset {
-        self.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default })
+        self.training.preset.unwrap_or(if device.info().is_cpu { Preset::Draft } else { Preset::Default })
     }
 
-    /// Refuses photos of these (width, height) where they cannot be worked with at that size.
+    /// Refuses photos of these (width, height) where the machine lacks the memory.
     pub(super) fn check_budget(
         &self,
         device: &Device,
         sizes: &[(usize, usize)],
         max_size: usize,
     ) -> Result<()> {
-        let work = self.work(self.preset_on(device), sizes.len());
+        let work = self.memory_demand(self.preset_on(device), sizes.len());
         budget::check(&budget::Limits::now(device.info()), sizes, max_size, &work)
     }
 
-    fn work(&self, preset: Preset, photos: usize) -> budget::MemoryDemand {
-        budget::MemoryDemand::language(self.feature_dim, self.per_level, preset, photos)
+    fn memory_demand(&self, preset: Preset, photos: usize) -> budget::MemoryDemand {
+        match &self.language {
+            Some(language) => budget::MemoryDemand::language(
+                language.feature_dim(self.training.preset),
+                language.per_level(),
+                preset,
+                photos,
+            ),
+            None => budget::MemoryDemand::colour(preset, photos),
+        }
     }
 
     /// The colour stage.
     pub(super) fn rgb_options(&self, preset: Preset, device: &Device, photos: usize) -> RgbOptions {
         let mut options = RgbOptions::preset(preset);
-        let work = self.work(preset, photos);
-        options.limit_splats(budget::most_splats(device.info(), work.features), work.splats);
-        options.seed = self.seed;
-        if let Some(n) = self.iterations {
+        let demand = self.memory_demand(preset, photos);
+        options.limit_splats(budget::most_splats(device.info(), demand.features), demand.splats);
+        options.seed = self.training.seed;
+        if let Some(n) = self.training.iterations {
             options = options.with_iterations(n);
         }
-        self.recipe().rgb(options)
+        self.trained_colours(options)
     }
 
     /// Colours that depend on the direction. A method that trains no colours has none.
     pub(super) fn view_dependent_options(&self, preset: Preset) -> ViewDependentOptions {
-        let trains = self.recipe().rgb(RgbOptions::preset(preset)).iterations > 0;
-        let degree = if trains { self.sh_degree } else { Some(0) };
-        ViewDependentOptions::preset(preset, degree, self.seed)
+        let trains = self.trained_colours(RgbOptions::preset(preset)).iterations > 0;
+        let degree = if trains { self.training.sh_degree } else { Some(0) };
+        ViewDependentOptions::preset(preset, degree, self.training.seed)
     }
 
-    /// The language stage.
-    pub(super) fn language_options(&self, preset: Preset) -> LanguageOptions {
+    /// The options as the method of the language takes them.
+    fn trained_colours(&self, options: RgbOptions) -> RgbOptions {
+        match &self.language {
+            Some(language) => language.recipe(self.training.preset).rgb(options),
+            None => options,
+        }
+    }
+
+    /// The language stage; `None` without language.
+    pub(super) fn language_options(&self, preset: Preset) -> Option<LanguageOptions> {
+        let language = self.language.as_ref()?;
         let mut options = LanguageOptions::preset(preset);
-        options.seed = self.seed;
-        options.per_level |= self.per_level;
-        options.iterations = self.language_iterations.unwrap_or(options.iterations);
-        options
+        options.seed = self.training.seed;
+        options.per_level |= language.per_level();
+        options.iterations = language.language_iterations.unwrap_or(options.iterations);
+        Some(options)
     }
 }

@@ -1,26 +1,121 @@
-//! Records of a finished run: `run.json`, the report and the closing table, made from
-//! [`RunOutcome`].
+//! `run.json`: what a run was asked for, did and measured, with types to write it and to read it
+//! back.
 use super::answer::Answers;
 use super::outcome::RunOutcome;
 use super::plan::RunPlan;
-use crate::Result;
-use crate::fit::{self, CurvePoint, FitStats, LanguagePoint, ViewDependence};
+use super::summary::confidence;
+use crate::fit::{self, CurvePoint, LanguagePoint, Preset};
+use crate::infer::ModelStatus;
 use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
-use crate::report::viewer::Scene3d;
-use crate::report::{self, AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
-use crate::scene::{Camera, LEVEL_NAMES, RgbImage, Seen, Splats, World};
-use serde_json::json;
+use crate::report::{self, Curve, ModelUsed};
+use crate::scene::{Camera, LEVEL_NAMES, Lens};
+use crate::{Error, Result, files};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
 use std::path::Path;
 
-/// What `run.json` holds, with the paths as they were typed.
+/// The content of `run.json`.
+pub type RunRecord = report::RunRecord<ConfigRecord, Statistics>;
+
+/// The run as it was asked for, and the choices that were left to the device.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct ConfigRecord {
+    /// The plan, with method and code length resolved.
+    pub plan: RunPlan,
+    /// The preset that was used.
+    pub preset: Option<Preset>,
+    /// The execution provider of the networks.
+    pub provider: Option<String>,
+}
+
+/// Figures of the run; those beside the geometry are free-form.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Statistics {
+    /// How the cameras were found.
+    pub geometry: GeometryRecord,
+    /// Photos, light, splats, curves, levels, alignment and queries.
+    #[serde(flatten)]
+    pub other: Map<String, Value>,
+}
+
+/// Cameras and points before training.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(default)]
+pub struct GeometryRecord {
+    /// The method.
+    pub method: String,
+    /// Number of points.
+    pub points: usize,
+    /// Focal length per photo, working pixels.
+    pub focal_px: Vec<f64>,
+    /// One standard deviation of ln f, where it was estimated.
+    pub focal_log_sigma: Option<f64>,
+    /// Per photo with estimated intrinsics.
+    pub optics: Vec<IntrinsicsRecord>,
+}
+
+/// Estimated intrinsics of one photo, in pixels of its file.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct IntrinsicsRecord {
+    /// Stem of the photo.
+    pub photo: String,
+    /// Focal length.
+    pub focal_px: f64,
+    /// Principal point, x.
+    pub cx: f64,
+    /// Principal point, y.
+    pub cy: f64,
+    /// Radial distortion.
+    pub k1: f64,
+    /// Radial distortion.
+    pub k2: f64,
+    /// One standard deviation of each; 0 = held fixed.
+    pub sigma: SigmaRecord,
+    /// Median reprojection error, working pixels.
+    pub residual_px: f64,
+    /// Share of the inliers of two-view geometries that agree with the cameras.
+    pub agreement: f64,
+    /// Camera id; photos of one id share intrinsics.
+    pub camera: usize,
+    /// One standard deviation of the rotation against the first photo.
+    pub rotation_sigma_degrees: f64,
+    /// Trust in the camera.
+    pub confidence: Option<Confidence>,
+}
+
+/// Standard deviations of intrinsics.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct SigmaRecord {
+    /// Of ln f.
+    pub log_focal: f64,
+    /// Of k1.
+    pub k1: f64,
+    /// Of k2.
+    pub k2: f64,
+    /// Of the principal point, x, pixels of the file.
+    pub cx: f64,
+    /// Of the principal point, y.
+    pub cy: f64,
+}
+
+/// The record of a finished run, with the paths as they were typed.
 pub fn run_record(o: &RunOutcome) -> RunRecord {
-    let used = |m: &&crate::infer::ModelStatus| m.installed;
-    let plan = RunPlan { method: Some(o.plan.method()), ..o.plan.clone() };
+    let used = |m: &&ModelStatus| m.installed;
+    let mut plan = o.plan.clone();
+    let preset = plan.config.training.preset;
+    if let Some(language) = &mut plan.config.language {
+        language.feature_dim = Some(language.feature_dim(preset));
+        language.method = Some(language.method(preset));
+    }
     RunRecord {
         program: format!("splatvk {}", env!("CARGO_PKG_VERSION")),
-        config: json!({ "plan": plan, "preset": o.preset, "provider": o.provider }),
-        seed: o.plan.seed,
+        seed: plan.config.training.seed,
+        config: ConfigRecord { plan, preset: Some(o.preset), provider: o.provider.map(str::to_owned) },
         device: o.device.name.clone(),
         device_is_cpu: o.device.is_cpu,
         models: o
@@ -37,42 +132,58 @@ pub fn run_record(o: &RunOutcome) -> RunRecord {
     }
 }
 
-fn statistics(o: &RunOutcome) -> serde_json::Value {
-    let curves = curves(&o.rgb, &o.language_curve);
-    let levels: Vec<_> = LEVEL_NAMES
-        .iter()
-        .zip(&o.field.levels)
-        .enumerate()
-        .map(|(at, (name, level))| {
-            json!({
-                "level": name, "codes": level.codebook.len(), "min_chord": level.codebook.min_chord,
-                "decode_accuracy": fit::decode_accuracy(&o.language_curve, at),
-            })
+/// Reads `run.json` of a scene directory; `remedy` ends the message of an error.
+///
+/// # Errors
+/// A file that is missing, or no record of a run.
+pub fn read(scene: &Path, remedy: &str) -> Result<RunRecord> {
+    let path = scene.join("run.json");
+    if !path.is_file() {
+        return Err(Error::input(format!("{}: missing; {remedy}", path.display())));
+    }
+    files::read_json(&path, remedy)
+}
+
+fn statistics(o: &RunOutcome) -> Statistics {
+    let language = o.language.as_ref();
+    let level = |(at, (name, level)): (usize, (&&str, &crate::scene::LevelField))| {
+        json!({
+            "level": name, "codes": level.codebook.len(), "min_chord": level.codebook.min_chord,
+            "decode_accuracy": fit::decode_accuracy(language.map_or(&[], |l| &l.curve), at),
         })
-        .collect();
-    json!({
+    };
+    let levels = language.map_or(&[][..], |l| &l.field.levels);
+    let levels: Vec<Value> = LEVEL_NAMES.iter().zip(levels).enumerate().map(level).collect();
+    let answers = language.map_or(&[][..], |l| &l.answers);
+    let other = json!({
         "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
         "choice": o.choice,
         "left_out": o.left_out,
         "added": added(o),
         "working_sizes": working_sizes(&o.photos),
-        "geometry": {
-            "method": o.geometry.method, "points": o.geometry.points.len(),
-            "focal_px": o.cameras.iter().map(|c| c.fx).collect::<Vec<_>>(),
-            "focal_log_sigma": o.geometry.focal_log_sigma,
-            "optics": optics(o),
-        },
         "world": o.world,
         "light": super::light::record(&o.photos),
         "splats": { "start": o.rgb.splats[0], "end": o.splats.len(), "unseen": o.seen.unseen() },
         "view_dependence": o.rgb.view_dependence,
         "psnr_train": o.psnr, "poses_refined": o.rgb.poses_refined,
         "loss": o.rgb.curve.iter().map(|p| json!([p.step, p.loss])).collect::<Vec<_>>(),
-        "curves": curves,
+        "curves": curves(o),
         "levels": levels,
-        "alignment": o.alignment.report,
-        "queries": o.answers.iter().map(|a| answer_json(a, o)).collect::<Vec<_>>(),
-    })
+        "alignment": language.map(|l| &l.alignment.report),
+        "queries": answers.iter().map(|a| answer_json(a, o)).collect::<Vec<_>>(),
+    });
+    let geometry = GeometryRecord {
+        method: o.geometry.method.clone(),
+        points: o.geometry.points.len(),
+        focal_px: o.cameras.iter().map(|c| c.fx).collect(),
+        focal_log_sigma: o.geometry.focal_log_sigma,
+        optics: intrinsics(o),
+    };
+    let other = match other {
+        Value::Object(other) => other,
+        _ => Map::new(),
+    };
+    Statistics { geometry, other }
 }
 
 /// What is known of the photos that joined a scene; `None` where the scene is a new one.
@@ -84,105 +195,57 @@ fn added(o: &RunOutcome) -> Option<serde_json::Value> {
             "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(), "psnr": o.psnr.get(v),
         })
     };
-    let scene = o.plan.add.as_ref()?;
+    let scene = o.plan.inputs.add.as_ref()?;
     let photos: Vec<_> = (o.known..o.photos.len()).map(one).collect();
     Some(json!({ "scene": scene.display().to_string(), "photos": photos }))
 }
 
-/// A line per photo that joined a scene.
-fn added_figures(o: &RunOutcome) -> Vec<(String, String)> {
-    if o.known == 0 {
-        return Vec::new();
-    }
-    let one = |v: usize| {
-        let confidence = confidence(&o.geometry.fitted[v], &o.psnr).name();
-        let psnr = o.psnr.get(v).copied().unwrap_or(0.0);
-        ("added".to_owned(), format!("{}: {confidence} confidence, {psnr:.2} dB", o.photos[v].stem))
-    };
-    (o.known..o.photos.len()).map(one).collect()
-}
-
-/// Per photo what was found of its lens, and the camera of its file.
-fn optics(o: &RunOutcome) -> Vec<serde_json::Value> {
+fn intrinsics(o: &RunOutcome) -> Vec<IntrinsicsRecord> {
     let one = |((photo, camera), fitted): ((&Photo, &Camera), &Fitted)| {
         let taken = photo.original_camera(camera);
-        json!({
-            "photo": photo.stem, "focal_px": taken.fx, "cx": taken.cx, "cy": taken.cy,
-            "k1": fitted.lens.k1, "k2": fitted.lens.k2,
-            "sigma": { "log_focal": fitted.sigmas[0], "k1": fitted.sigmas[1], "k2": fitted.sigmas[2],
-                "cx": fitted.sigmas[3], "cy": fitted.sigmas[4] },
-            "residual_px": fitted.residual, "agreement": fitted.agreement, "camera": fitted.camera,
-            "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(),
-            "confidence": confidence(fitted, &o.psnr),
-        })
+        let [log_focal, k1, k2, cx, cy] = fitted.sigmas;
+        IntrinsicsRecord {
+            photo: photo.stem.clone(),
+            focal_px: taken.fx,
+            cx: taken.cx,
+            cy: taken.cy,
+            k1: fitted.lens.k1,
+            k2: fitted.lens.k2,
+            sigma: SigmaRecord { log_focal, k1, k2, cx, cy },
+            residual_px: fitted.residual,
+            agreement: fitted.agreement,
+            camera: fitted.camera,
+            rotation_sigma_degrees: fitted.rotation_sigma.to_degrees(),
+            confidence: Some(confidence(fitted, &o.psnr)),
+        }
     };
     o.photos.iter().zip(&o.cameras).zip(&o.geometry.fitted).map(one).collect()
 }
 
-/// The focal length of every camera that the photos were taken with, as far as it was measured.
-fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Option<String> {
-    let mut groups: Vec<(usize, String, Vec<&str>)> = Vec::new();
-    for ((photo, camera), fitted) in photos.iter().zip(cameras).zip(fitted) {
-        match groups.iter_mut().find(|c| c.0 == fitted.camera) {
-            Some(known) => known.2.push(&photo.stem),
-            None => {
-                let text = format!("{:.1} px ± {:.2} %", camera.fx, 100.0 * fitted.sigmas[0]);
-                groups.push((fitted.camera, text, vec![&photo.stem]));
-            }
+impl RunRecord {
+    /// How the camera of a photo was found; where that was not estimated, cameras were given and
+    /// stand.
+    pub(super) fn fitted(&self, stem: &str) -> Fitted {
+        let Some(own) = self.statistics.geometry.optics.iter().find(|o| o.photo == stem) else {
+            return Fitted { agreement: 1.0, ..Fitted::default() };
+        };
+        let SigmaRecord { log_focal, k1, k2, cx, cy } = own.sigma;
+        Fitted {
+            lens: Lens::radial(own.k1, own.k2),
+            sigmas: [log_focal, k1, k2, cx, cy],
+            residual: own.residual_px,
+            agreement: own.agreement,
+            // What else makes a place doubtful is not recorded by itself.
+            unconfirmed: own.confidence == Some(Confidence::Low),
+            rotation_sigma: own.rotation_sigma_degrees.to_radians(),
+            camera: own.camera,
         }
     }
-    match groups.as_slice() {
-        [] => None,
-        [(_, text, _)] => Some(text.clone()),
-        several => {
-            let each = several.iter().map(|(_, text, photos)| format!("{text} ({})", photos.join(", ")));
-            Some(each.collect::<Vec<_>>().join("; "))
-        }
-    }
-}
-
-/// Trust in the camera of a photo: what the cameras say of themselves, and no more than how well
-/// the scene shows the photos.
-fn confidence(fitted: &Fitted, psnr: &[f64]) -> Confidence {
-    fitted.confidence().min(super::fidelity::ceiling(psnr))
-}
-
-/// How far the cameras are to be trusted: that of the worst, and which are worse than the best.
-fn confidence_figure(photos: &[Photo], fitted: &[Fitted], psnr: &[f64]) -> Option<String> {
-    let levels: Vec<Confidence> = fitted.iter().map(|f| confidence(f, psnr)).collect();
-    let (worst, best) = (levels.iter().min()?, levels.iter().max()?);
-    let named = photos.iter().zip(&levels).filter(|(_, l)| *l < best).map(|(p, _)| p.stem.as_str());
-    let named: Vec<&str> = named.collect();
-    let which = if named.is_empty() { String::new() } else { format!(" ({})", named.join(", ")) };
-    Some(format!("{} confidence{which}", worst.name()))
-}
-
-/// What was assumed about the lens: the strongest distortion taken out, and how far the principal
-/// point is from the middle.
-fn lens_figure(o: &RunOutcome) -> Option<String> {
-    let corner = |(photo, camera): (&Photo, &Camera)| {
-        let half = glam::DVec2::new(0.5 * camera.width as f64, 0.5 * camera.height as f64) / camera.fx;
-        (photo.lens().distort(half).length() / half.length() - 1.0, photo.lens())
-    };
-    let all = o.photos.iter().zip(&o.cameras).map(corner);
-    let (share, lens) = all.max_by(|a, b| a.0.abs().total_cmp(&b.0.abs()))?;
-    let camera = o.cameras.first()?;
-    let shift = [camera.cx / camera.width as f64 - 0.5, camera.cy / camera.height as f64 - 0.5];
-    let bend = match lens.is_none() {
-        true => "no distortion seen".to_owned(),
-        false => {
-            format!("k1 {:.3}, k2 {:.3} ({:+.1} % at the corner), taken out", lens.k1, lens.k2, 100.0 * share)
-        }
-    };
-    let centre = match shift.iter().all(|s| s.abs() < 1e-9) {
-        true => String::new(),
-        false => format!("; centre off by {:+.1}, {:+.1} %", 100.0 * shift[0], 100.0 * shift[1]),
-    };
-    (!o.geometry.fitted.is_empty()).then(|| bend + &centre)
 }
 
 /// Figures over the steps of the colour stage and, where there was one, of the language stage.
-pub(super) fn curves(rgb: &FitStats, language: &[LanguagePoint]) -> Vec<Curve> {
+pub(super) fn curves(o: &RunOutcome) -> Vec<Curve> {
+    let (rgb, language) = (&o.rgb, o.language.as_ref().map_or(&[][..], |l| &l.curve));
     let colour = |name, unit, get: fn(&CurvePoint) -> f64| Curve {
         name,
         unit,
@@ -221,201 +284,48 @@ fn answer_json(a: &Answers, o: &RunOutcome) -> serde_json::Value {
     entry
 }
 
-/// Figures for the head of the report and the closing table: (label, value).
-fn figures(o: &RunOutcome) -> Vec<(String, String)> {
-    let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
-    // Which, and why, is said when they are chosen, and in run.json.
-    let mut chosen = o.choice.as_ref().map_or(String::new(), |c| {
-        format!("; {} chosen of {}", c.used.len(), c.used.len() + c.left_out.len())
-    });
-    if !o.left_out.is_empty() {
-        let names: Vec<&str> = o.left_out.iter().map(|l| l.photo.as_str()).collect();
-        chosen += &format!("; left out: {}", names.join(", "));
-    }
-    let mut list = vec![
-        ("device".to_owned(), format!("{}{cpu}", o.device.name)),
-        ("photos".to_owned(), sizes(&o.photos) + &chosen),
-        splats_figure(&o.splats, &o.seen),
-        super::fidelity::figure(&o.psnr),
-    ];
-    list.extend(view_dependence_figure(&o.rgb.view_dependence));
-    list.extend(added_figures(o));
-    list.extend(
-        focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| ("focal length".to_owned(), text)),
-    );
-    list.extend(
-        confidence_figure(&o.photos, &o.geometry.fitted, &o.psnr).map(|text| ("cameras".to_owned(), text)),
-    );
-    list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
-    list.push(up_figure(&o.world));
-    list.extend(super::light::figure(&o.photos));
-    let codes = |k: usize| o.field.levels.get(k).map_or(0, |l| l.codebook.len());
-    list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
-    for a in &o.answers {
-        list.push((format!("“{}”", report::one_line(&a.text)), a.verdict()));
-    }
-    list
-}
-
-/// How many splats there are, and how many of them are guessed.
-pub(super) fn splats_figure(splats: &Splats, seen: &Seen) -> (String, String) {
-    let guessed = match seen.unseen() {
-        0 => String::new(),
-        n => format!(", {n} of them where no photo looks"),
-    };
-    ("splats".to_owned(), format!("{}{guessed}", splats.len()))
-}
-
-/// The SH degree of the colours, if it is not 0, and what photos say of it.
-pub(super) fn view_dependence_figure(found: &ViewDependence) -> Option<(String, String)> {
-    let text = match (found.degree, found.trials.last()) {
-        (0, _) => return None,
-        (degree, Some(t)) if t.supported() => {
-            format!("SH degree {degree}: photos left out are shown {:.1} dB better by it", t.gain)
-        }
-        (degree, _) => format!("SH degree {degree}"),
-    };
-    Some(("colours".to_owned(), text))
-}
-
-/// Which way is up, and what says so.
-pub(super) fn up_figure(world: &World) -> (String, String) {
-    let text = match &world.up {
-        Some(up) => {
-            let evidence: Vec<&str> = up.evidence.iter().map(|e| e.text()).collect();
-            format!("± {:.1}° ({})", up.sigma_degrees, evidence.join(", "))
-        }
-        None => "not known: too few edges and surfaces agree on one direction".to_owned(),
-    };
-    ("up".to_owned(), text)
-}
-
 /// Per photo its working and its original (width, height).
-pub(super) fn working_sizes(photos: &[Photo]) -> serde_json::Value {
+fn working_sizes(photos: &[Photo]) -> serde_json::Value {
     let size = |p: &Photo| json!({ "working": [p.image.width, p.image.height], "original": [p.original_size.0, p.original_size.1] });
     photos.iter().map(size).collect()
-}
-
-/// How many photos were used, at which size, and how to change that where they were scaled down.
-pub(super) fn sizes(photos: &[Photo]) -> String {
-    #[derive(PartialEq)]
-    struct Sizes {
-        working: (usize, usize),
-        original: (usize, usize),
-    }
-    let mut pairs: Vec<Sizes> = Vec::new();
-    for p in photos {
-        let original = (p.original_size.0 as usize, p.original_size.1 as usize);
-        let pair = Sizes { working: (p.image.width, p.image.height), original };
-        if !pairs.contains(&pair) {
-            pairs.push(pair);
-        }
-    }
-    let scaled = |s: &Sizes| s.working != s.original;
-    let one = |s: &Sizes| {
-        let ((w, h), (original_w, original_h)) = (s.working, s.original);
-        match scaled(s) {
-            true => format!("{w} × {h} of {original_w} × {original_h}"),
-            false => format!("{w} × {h}"),
-        }
-    };
-    // More than a few sizes would not fit a line; run.json has them all.
-    let shown: Vec<String> = pairs.iter().take(3).map(one).collect();
-    let more = if pairs.len() > 3 { ", …" } else { "" };
-    let hint = if photos.iter().any(|p| p.zoom() < 1.0) { " (--max-size changes it)" } else { "" };
-    format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
-}
-
-/// The table that ends `splatvk run`; where the scene is of doubtful quality that stands first.
-pub fn closing_table(o: &RunOutcome) -> String {
-    super::fidelity::heading(&o.psnr) + &report::table(&o.stages, o.seconds, &figures(o))
-}
-
-/// Writes `run.json`, `report.html` and `previews/`.
-pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
-    let record = run_record(o).without_folders(o.plan.read().chain([o.plan.out.as_path()]));
-    record.write(folder)?;
-    let levels: Vec<Vec<_>> =
-        o.frames.iter().map(|f| LEVEL_NAMES.into_iter().zip(f.codes.iter().cloned()).collect()).collect();
-    // What renders are compared with.
-    let targets: Vec<RgbImage> = o.photos.iter().map(Photo::target).collect();
-    let views = o
-        .photos
-        .iter()
-        .enumerate()
-        .map(|(i, p)| ViewShown {
-            name: &p.stem,
-            photo: &targets[i],
-            render: Some(&o.frames[i].rendered.rgb),
-            depth: Some(&o.frames[i].rendered.depth),
-            levels: &levels[i],
-            psnr: o.psnr.get(i).copied(),
-            light: p.light,
-        })
-        .collect();
-    let title = o.plan.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    let report = HtmlReport {
-        title: &title,
-        views,
-        queries: o.answers.iter().map(shown).collect(),
-        curves: curves(&o.rgb, &o.language_curve),
-        space: Some(&o.field.space),
-        scene: Some(scene(&title, &targets, o)),
-        figures: figures(o),
-        run: &record,
-    };
-    report::write_html(folder, &report)?;
-    report::write_previews(folder, &report)
-}
-
-fn scene<'a>(title: &'a str, photos: &'a [RgbImage], o: &'a RunOutcome) -> Scene3d<'a> {
-    Scene3d {
-        title,
-        splats: &o.splats,
-        seen: &o.seen,
-        cameras: &o.cameras,
-        world: &o.world,
-        photos: photos.iter().collect(),
-        language: Some(&o.field),
-        names: &o.names,
-        answers: o.answers.iter().map(Answers::shown).collect(),
-    }
-}
-
-fn shown(a: &Answers) -> QueryShown<'_> {
-    let answers = a
-        .views
-        .iter()
-        .enumerate()
-        .map(|(view, v)| AnswerShown {
-            view,
-            relevancy: &v.relevancy,
-            mask: Some(&v.mask),
-            score: v.score,
-            found: v.found,
-            level: LEVEL_NAMES[v.level],
-        })
-        .collect();
-    QueryShown { text: &a.text, verdict: a.sentence(), answers }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::RgbImage;
-    use crate::scene::seeded;
+    use crate::run::sources::SourceChoice;
+    use crate::run::{LanguageConfig, ReconstructionConfig};
 
     #[test]
-    fn the_focal_length_is_told_per_camera() {
-        let image = RgbImage { width: 64, height: 64, data: vec![[0.5; 3]; 64 * 64] };
-        let photo = |name: &str| crate::photo::from_pixels(name.as_ref(), &image, None, 64).unwrap();
-        let photos = ["a.png", "b.png", "c.png", "d.png"].map(photo);
-        let camera = seeded::small(1, 64, 64, 0, 1).1;
-        let cameras = [300.0, 400.0, 300.0, 400.0].map(|fx| Camera { fx, ..camera.clone() });
-        let fitted = |camera| Fitted { camera, sigmas: [0.002, 0.0, 0.0, 0.0, 0.0], ..Fitted::default() };
-        let text = |of: [usize; 4]| focal_figure(&photos, &cameras, &of.map(fitted)).unwrap();
-        assert_eq!(text([0; 4]), "300.0 px ± 0.20 %");
-        assert_eq!(text([0, 1, 0, 1]), "300.0 px ± 0.20 % (a, c); 400.0 px ± 0.20 % (b, d)");
-        assert_eq!(focal_figure(&photos, &cameras, &[]), None);
+    fn record_is_read_back_whole() {
+        let mut plan = RunPlan::default();
+        plan.inputs.photos = vec!["a.jpg".into()];
+        plan.config.training.seed = 7;
+        let statistics = Statistics {
+            geometry: GeometryRecord {
+                optics: vec![IntrinsicsRecord { photo: "a".into(), k1: 0.1, ..Default::default() }],
+                ..Default::default()
+            },
+            other: Map::from_iter([("loss".to_owned(), json!([1.5]))]),
+        };
+        let config = ConfigRecord { plan, preset: Some(Preset::Paper), provider: None };
+        let record = RunRecord { config, statistics, ..RunRecord::default() };
+        let text = serde_json::to_string(&record).unwrap();
+        let back: RunRecord = serde_json::from_str(&text).unwrap();
+        assert_eq!(serde_json::to_string(&back).unwrap(), text);
+        assert_eq!(back.config.plan.config, record.config.plan.config);
+        assert_eq!(back.fitted("a").lens, Lens::radial(0.1, 0.0));
+        assert_eq!(back.fitted("b").agreement, 1.0);
+    }
+
+    #[test]
+    fn missing_language_stays_missing() {
+        let config = ReconstructionConfig { language: None, ..ReconstructionConfig::default() };
+        let plan = RunPlan { config, ..RunPlan::default() };
+        let back: RunPlan = serde_json::from_value(json!(plan)).unwrap();
+        assert_eq!(back.config.language, None);
+        let bare: RunPlan = serde_json::from_value(json!({ "masks": "dir:there" })).unwrap();
+        let masks = SourceChoice::from("dir:there");
+        assert_eq!(bare.config.language, Some(LanguageConfig { masks, ..LanguageConfig::default() }));
     }
 }

@@ -1,4 +1,4 @@
-//! The readers and the valid files that are damaged for them.
+//! The readers, with the valid files to damage.
 use super::heap::Heap;
 use super::mutate::{Random, damaged};
 use super::{HEAP, seeds};
@@ -11,31 +11,31 @@ use splatvk::infer::adapter::Adapter;
 use splatvk::infer::{depth_prior, onnx};
 use splatvk::language::dir::{DirMasks, TextEmbeddings};
 use splatvk::photo;
-use splatvk::run::base::Settings;
+use splatvk::run::base::record_of;
 use splatvk::scene::{LanguageField, Splats};
 use splatvk::{Error, Result};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// What a reader may take.
+/// Limits of a reader.
 pub struct Limits;
 
 impl Limits {
-    /// However the file is damaged.
+    /// Longest time for any damage.
     pub const TIME: Duration = Duration::from_secs(1);
     /// Bytes beside four times the file and the file itself.
     pub const ROOM: usize = 64 << 20;
-    /// Of a decoded photo: those that state more than 20 megapixels are not decoded here, and 16
-    /// bytes a pixel and as much again in the decoder are the most.
+    /// Bytes for a decoded photo: photos of more than 20 megapixels are not decoded here, and at
+    /// most 16 bytes per pixel are needed, and the same again in the decoder.
     const PHOTO_ROOM: usize = 2 * 16 * 20_000_000 + Limits::ROOM;
-    /// Decoding 20 megapixels takes a second of a busy machine.
+    /// Decoding 20 megapixels takes a second on a busy machine.
     const PHOTO_TIME: Duration = Duration::from_secs(5);
-    /// Where images of labels are read: what a decoded image may take.
+    /// Bytes for readers of label images: the limit of a decoded image.
     const LABELS_ROOM: usize = (2 << 30) + Limits::ROOM;
 }
 
-/// What became of one file.
+/// Result of reading one file.
 #[derive(Debug)]
 pub struct Verdict {
     pub read: bool,
@@ -44,14 +44,14 @@ pub struct Verdict {
     pub error: Option<String>,
 }
 
-/// Takes the content out of its container and puts it back, changed, with right sums and lengths.
+/// Unpacks the content of a container and repacks it, changed, with correct checksums and lengths.
 pub type Container = fn(&[u8], &mut dyn FnMut(&[u8]) -> Vec<u8>) -> Vec<u8>;
 
 /// A file of a reader's folder.
 pub struct Seed {
     pub name: String,
     pub bytes: Vec<u8>,
-    /// Not all are damaged: some are only needed by the others.
+    /// False for files that only others need.
     pub damaged: bool,
     pub container: Option<Container>,
 }
@@ -88,7 +88,7 @@ impl Reader {
         let seed = *random.pick(&open);
         let others: Vec<&[u8]> = open.iter().map(|s| s.bytes.as_slice()).collect();
         let bytes = match seed.container {
-            // The container itself now and then.
+            // The container itself is damaged now and then.
             Some(container) if random.below(4) > 0 => {
                 container(&seed.bytes, &mut |inside| damaged(inside, &[inside], random))
             }
@@ -104,13 +104,13 @@ impl Reader {
     }
 }
 
-/// Reads files of `size` bytes and holds what it takes against the limits.
+/// Reads files of `size` bytes and checks time and memory against the limits.
 pub fn within(size: usize, (room, most): (usize, Duration), read: impl FnOnce() -> Result<()>) -> Verdict {
     let (mark, began, worked) = (Heap::mark(&HEAP), Instant::now(), processor_time());
     let outcome = catch_unwind(AssertUnwindSafe(read));
     let peak = HEAP.peak_above(mark);
-    // Other programs make the clock run on, waiting does not make the processor work: neither is
-    // the reader's time by itself.
+    // Other programs prolong the wall time, and waiting uses no processor time: neither alone is
+    // the reader's time.
     let time = match processor_time().zip(worked) {
         Some((now, before)) => (now - before).min(began.elapsed()).max(began.elapsed() / 10),
         None => began.elapsed(),
@@ -127,7 +127,7 @@ pub fn within(size: usize, (room, most): (usize, Duration), read: impl FnOnce() 
     Verdict { read: matches!(outcome, Ok(Ok(()))), time, fault, error }
 }
 
-/// Of all threads of this process so far; only one reader runs at a time.
+/// Processor time of all threads of this process; only one reader runs at a time.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 fn processor_time() -> Option<Duration> {
     let mut time = libc::timespec { tv_sec: 0, tv_nsec: 0 };
@@ -141,7 +141,7 @@ fn processor_time() -> Option<Duration> {
     None
 }
 
-/// Gaussians are all finite once they are read, and can be written.
+/// Reads Gaussians; checks that they are finite and can be written.
 fn gaussians_of(folder: &Path, name: &str) -> Result<()> {
     let (splats, _) = gaussians::read(&folder.join(name))?;
     let numbers = splats.means.as_flattened().iter().chain(splats.log_scales.as_flattened());
@@ -165,7 +165,7 @@ fn photo_of(folder: &Path, name: &str) -> Result<()> {
     }
 }
 
-/// All readers of bytes from outside.
+/// All readers of untrusted bytes.
 pub fn all() -> Vec<Reader> {
     let mut all = vec![
         Reader::new("ply", seeds::gaussians("a.ply", 1), |f| gaussians_of(f, "a.ply")),
@@ -198,10 +198,10 @@ pub fn all() -> Vec<Reader> {
         Reader::new("npz", vec![seeds::npz("a.npz")], |f| npy::read_npz(f.join("a.npz")).map(drop)),
         Reader::new("scene", seeds::scene(), |f| scene_dir::load(f).map(drop)),
         Reader::new("scene-photos", seeds::scene_photos(), |f| scene_photos::load(f).map(drop)),
-        Reader::new("run-json", vec![seeds::run_json()], |f| Settings::read(f).map(|s| drop(s.queries(&[])))),
+        Reader::new("run-json", vec![seeds::run_json()], |f| record_of(f).map(drop)),
         Reader::new("checkpoint", vec![seeds::checkpoint("a.state")], |f| {
             let kept = Checkpoint::new(f.join("a.state"), Duration::ZERO, true);
-            // Absent where it is damaged: the work begins anew.
+            // A damaged state is ignored: the work restarts.
             match kept.load::<(Splats, LanguageField)>() {
                 Some(_) => Ok(()),
                 None => Err(Error::input("absent")),
@@ -214,7 +214,7 @@ pub fn all() -> Vec<Reader> {
         Reader::new("onnx", vec![seeds::file("m.onnx", seeds::onnx())], |f| {
             let model = f.join("m.onnx");
             let header = onnx::read(&model)?;
-            // Whatever it is, it fits or the error says what it has.
+            // Either it fits, or the error describes the graph.
             let _ = Adapter::default().fit(&model, &header);
             Ok(())
         }),

@@ -1,5 +1,5 @@
 //! `splatvk bench`: what to measure, and on what.
-use super::number::whole;
+use super::whole;
 use crate::Result;
 use crate::infer::{Compute, Registry};
 use crate::photo::SMALLEST_SIDE;

@@ -1,19 +1,10 @@
 //! Options of several commands.
-use super::number::whole;
 use crate::Result;
-use crate::infer::{Compute, Registry};
-use crate::photo::SMALLEST_SIDE;
-use crate::run::compat::{COMPATS, NONE};
-use clap::builder::{PossibleValue, PossibleValuesParser};
+use crate::infer::Registry;
+use crate::run::config::{EXPERTS, whole};
+use crate::run::{CHECKPOINT_SECONDS, Destination, Machine};
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
-
-/// What `--compat` takes.
-pub fn compats() -> PossibleValuesParser {
-    let own = PossibleValue::new(NONE).help("this program's own way");
-    let all = COMPATS.iter().map(|c| PossibleValue::new(c.name).help(c.about));
-    PossibleValuesParser::new(all.chain([own]))
-}
 
 /// What goes to standard error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -24,32 +15,12 @@ pub enum LogFormat {
     Json,
 }
 
-/// How much time a run may take.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum PresetArg {
-    /// Minutes on a 2-core CPU
-    Draft,
-    /// Best quality for the time on a GPU
-    Default,
-    /// The paper's schedule and constants
-    Paper,
-}
-
-/// Heading of the options that few need.
-pub const EXPERTS: &str = "For experts";
 /// Heading of the options about the machine.
 pub const MACHINE: &str = "Device and networks";
 
-/// Options of the commands that make scenes.
+/// Options of the commands that make scenes, about files.
 #[derive(Clone, Debug, Args)]
-pub struct MakingArgs {
-    /// Time against quality [default: draft on a CPU device, default on a GPU]
-    #[arg(long, value_enum)]
-    pub preset: Option<PresetArg>,
-    /// Longer side of the working images in pixels; larger photos are scaled down, none is enlarged
-    /// [default: 800 on a CPU device, 1600 on a GPU]
-    #[arg(long, value_name = "N", value_parser = whole::<usize>(SMALLEST_SIDE as u64..))]
-    pub max_size: Option<usize>,
+pub struct SavingArgs {
     /// Go on where an earlier command ended, or change a late option: stages with the same photos
     /// and settings are not run again
     #[arg(long)]
@@ -61,23 +32,17 @@ pub struct MakingArgs {
     /// beside images]
     #[arg(long, value_name = "DIR")]
     pub photo_masks: Option<PathBuf>,
-    /// Optimisation steps of the colour stage, instead of the preset's
-    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..), help_heading = EXPERTS)]
-    pub iterations: Option<usize>,
-    /// Spherical-harmonics degree of the colours, which then depend on the direction [default: what
-    /// photos support that are left out for a test; 0 for fewer than four photos]
-    #[arg(long, value_name = "0-3", value_parser = whole::<u32>(0..=3), help_heading = EXPERTS)]
-    pub sh_degree: Option<u32>,
-    /// Seed of everything random
-    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u64>(0..), help_heading = EXPERTS)]
-    pub seed: u64,
-    /// Same bits on every run on one machine: training adds up gradients in a fixed order, about a
-    /// tenth slower
-    #[arg(long, help_heading = EXPERTS)]
-    pub deterministic: bool,
     /// How often training keeps its state for --resume, seconds
-    #[arg(long, default_value_t = crate::run::CHECKPOINT_SECONDS, value_name = "N", value_parser = whole::<u64>(0..), help_heading = EXPERTS)]
+    #[arg(long, default_value_t = CHECKPOINT_SECONDS, value_name = "N", value_parser = whole::<u64>(0..), help_heading = EXPERTS)]
     pub checkpoint_seconds: u64,
+}
+
+impl SavingArgs {
+    /// The scene directory, and what earlier runs left for it.
+    pub fn destination(&self, out: PathBuf) -> Destination {
+        let SavingArgs { resume, force, checkpoint_seconds, .. } = *self;
+        Destination { out, force, resume, checkpoint_seconds }
+    }
 }
 
 /// Options that every command working on a device takes.
@@ -98,8 +63,14 @@ pub struct DeviceArgs {
 }
 
 impl DeviceArgs {
+    /// Device, models and provider of a run.
+    pub fn machine(&self) -> Machine {
+        let DeviceArgs { device, models, provider, .. } = self.clone();
+        Machine { device, models, provider }
+    }
+
     /// The models.
     pub fn registry(&self) -> Result<Registry> {
-        Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref()))
+        self.machine().registry()
     }
 }

@@ -5,6 +5,7 @@ use crate::language::sam::SamOptions;
 use crate::photo::Photo;
 use crate::pipeline::{Graph, Output};
 use crate::preset::Preset;
+use crate::run::config::{LanguageConfig, ReconstructionConfig};
 use crate::run::stages::PlacedPhotos;
 use crate::{Error, Result, pose};
 use std::fmt;
@@ -41,6 +42,21 @@ impl fmt::Display for SourceChoice {
             Some(argument) => write!(f, "{}:{}", self.name, argument.display()),
             None => f.write_str(&self.name),
         }
+    }
+}
+
+impl From<&str> for SourceChoice {
+    fn from(text: &str) -> SourceChoice {
+        match text.split_once(':') {
+            Some((name, argument)) => SourceChoice::with(name, argument),
+            None => SourceChoice::named(text),
+        }
+    }
+}
+
+impl<'de> serde::Deserialize<'de> for SourceChoice {
+    fn deserialize<D: serde::Deserializer<'de>>(from: D) -> std::result::Result<SourceChoice, D::Error> {
+        Ok(String::deserialize(from)?.as_str().into())
     }
 }
 
@@ -114,6 +130,22 @@ pub struct GraphBuilder {
     pub preset: Preset,
     /// Of everything random in cameras and depth.
     pub seed: u64,
+}
+
+impl GraphBuilder {
+    /// An empty graph for a configuration.
+    pub fn new(config: &ReconstructionConfig, preset: Preset, registry: &Registry) -> GraphBuilder {
+        let language = config.language.as_ref();
+        GraphBuilder {
+            graph: Graph::default(),
+            registry: registry.clone(),
+            sam: language.map_or_else(SamOptions::default, LanguageConfig::sam),
+            given_features: language.is_some_and(|l| l.features.argument.is_some()),
+            depth_prior: config.geometry.depth_prior.clone(),
+            preset,
+            seed: config.training.seed,
+        }
+    }
 }
 
 /// Photos with their geometry, as stages of a graph.

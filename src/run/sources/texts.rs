@@ -123,36 +123,36 @@ impl RegionEncoder for DirTexts {
         }
         Ok(rows)
     }
-    fn holds(&self, text: &str) -> bool {
+    fn has_table_entry(&self, text: &str) -> bool {
         self.texts.get(text).is_some()
     }
-    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+    fn embed_other_things(&mut self, form: &str) -> Result<Vec<f32>> {
         let rows = self.known(&things::of_form(form));
         match &mut self.tower {
-            Some(tower) if rows.len() < MIN_OTHERS * self.texts.dim => tower.network.others(form),
+            Some(tower) if rows.len() < MIN_OTHERS * self.texts.dim => tower.network.embed_other_things(form),
             _ => Ok(rows),
         }
     }
-    fn recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
+    fn embed_recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
         match &mut self.tower {
-            Some(tower) => tower.network.recoloured(text),
+            Some(tower) => tower.network.embed_recoloured(text),
             None => Ok(self.known(&things::recoloured(text))),
         }
     }
-    fn names(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
+    fn name_regions(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
         let named: Vec<_> = self.texts.iter().filter(|(p, _)| !CANONICAL_PHRASES.contains(p)).collect();
         let rows: Vec<f32> = named.iter().flat_map(|(_, v)| v.iter().copied()).collect();
         let found = nearest(regions, &rows, self.texts.dim, best);
         let text = |(i, cosine): (usize, f32)| (named[i].0.to_owned(), cosine);
         Ok(found.into_iter().map(|list| list.into_iter().map(text).collect()).collect())
     }
-    fn embedded_by(&self, text: &str) -> Option<String> {
+    fn embedding_source(&self, text: &str) -> Option<String> {
         match self.texts.get(text) {
             Some(_) => Some("text_embeddings.npz".to_owned()),
             None => self.tower.as_ref().map(|t| t.name.clone()),
         }
     }
-    fn doubt(&self) -> Option<String> {
+    fn embedding_warning(&self) -> Option<String> {
         let tower = self.tower.as_ref().filter(|t| !t.proven)?;
         Some(format!(
             "texts are embedded by {}, since it gives {} values as the features have: whether it is their space cannot be known \
@@ -183,20 +183,20 @@ mod tests {
         // Without a table the length is all that is known.
         let mut towers = encoder(folder.path(), Some(3));
         let blue = towers.embed_texts(&["blue"]).unwrap();
-        assert_eq!(towers.embedded_by("blue").as_deref(), Some("clip_toy"));
-        assert!(towers.doubt().unwrap().contains("clip_toy"), "{:?}", towers.doubt());
+        assert_eq!(towers.embedding_source("blue").as_deref(), Some("clip_toy"));
+        assert!(towers.embedding_warning().unwrap().contains("clip_toy"), "{:?}", towers.embedding_warning());
 
         table(blue.clone());
         let mut both = encoder(folder.path(), None);
         assert_eq!(both.embed_texts(&["blue"]).unwrap(), blue);
         assert_eq!(
-            (both.embedded_by("blue").as_deref(), both.embedded_by("green")),
+            (both.embedding_source("blue").as_deref(), both.embedding_source("green")),
             (Some("text_embeddings.npz"), None)
         );
         let green = both.embed_texts(&["green"]).unwrap();
         assert!(cosine(&green, &blue) < 0.9 && (cosine(&green, &green) - 1.0).abs() < 1e-5);
-        assert_eq!(both.embedded_by("green").as_deref(), Some("clip_toy"));
-        assert_eq!(both.doubt(), None, "the network says of \"blue\" what the table says");
+        assert_eq!(both.embedding_source("green").as_deref(), Some("clip_toy"));
+        assert_eq!(both.embedding_warning(), None, "the network says of \"blue\" what the table says");
 
         table(blue.iter().map(|v| -v).collect());
         let mut other = encoder(folder.path(), None);

@@ -78,11 +78,11 @@ impl Stage for EmbedQueries {
         self.encoder.with(|e| {
             let queries = ask::queries(&self.texts, e, false)?;
             for text in &self.texts {
-                if let Some(name) = e.embedded_by(text) {
+                if let Some(name) = e.embedding_source(text) {
                     context.progress.inform(&format!("“{text}” embedded by {name}"));
                 }
             }
-            e.doubt().iter().for_each(|doubt| context.progress.warn(doubt));
+            e.embedding_warning().iter().for_each(|warning| context.progress.warn(warning));
             Ok(queries)
         })
     }

@@ -1,4 +1,4 @@
-//! Numbers as values of options: what is none, or lies outside, is refused with the range.
+//! Whole numbers of a range as values of options.
 use std::ops::{Bound, RangeBounds};
 
 /// Parses a whole number of a range.

@@ -1,0 +1,284 @@
+//! The report and the closing table of a finished run, made from [`RunOutcome`].
+use super::answer::Answers;
+use super::outcome::RunOutcome;
+use super::record::{curves, run_record};
+use crate::Result;
+use crate::fit::ViewDependence;
+use crate::photo::Photo;
+use crate::pose::{Confidence, Fitted};
+use crate::report::viewer::{CodeNames, Scene3d};
+use crate::report::{self, AnswerShown, HtmlReport, QueryShown, ViewShown};
+use crate::scene::{Camera, LEVEL_NAMES, RgbImage, Seen, Splats, World};
+use std::path::Path;
+
+/// A line per photo that joined a scene.
+fn added_figures(o: &RunOutcome) -> Vec<(String, String)> {
+    if o.known == 0 {
+        return Vec::new();
+    }
+    let one = |v: usize| {
+        let confidence = confidence(&o.geometry.fitted[v], &o.psnr).name();
+        let psnr = o.psnr.get(v).copied().unwrap_or(0.0);
+        ("added".to_owned(), format!("{}: {confidence} confidence, {psnr:.2} dB", o.photos[v].stem))
+    };
+    (o.known..o.photos.len()).map(one).collect()
+}
+
+/// The focal length of every camera that the photos were taken with, as far as it was measured.
+fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Option<String> {
+    let mut groups: Vec<(usize, String, Vec<&str>)> = Vec::new();
+    for ((photo, camera), fitted) in photos.iter().zip(cameras).zip(fitted) {
+        match groups.iter_mut().find(|c| c.0 == fitted.camera) {
+            Some(known) => known.2.push(&photo.stem),
+            None => {
+                let text = format!("{:.1} px ± {:.2} %", camera.fx, 100.0 * fitted.sigmas[0]);
+                groups.push((fitted.camera, text, vec![&photo.stem]));
+            }
+        }
+    }
+    match groups.as_slice() {
+        [] => None,
+        [(_, text, _)] => Some(text.clone()),
+        several => {
+            let each = several.iter().map(|(_, text, photos)| format!("{text} ({})", photos.join(", ")));
+            Some(each.collect::<Vec<_>>().join("; "))
+        }
+    }
+}
+
+/// Trust in the camera of a photo: what the cameras say of themselves, and no more than how well
+/// the scene shows the photos.
+pub(super) fn confidence(fitted: &Fitted, psnr: &[f64]) -> Confidence {
+    fitted.confidence().min(super::fidelity::ceiling(psnr))
+}
+
+/// How far the cameras are to be trusted: that of the worst, and which are worse than the best.
+fn confidence_figure(photos: &[Photo], fitted: &[Fitted], psnr: &[f64]) -> Option<String> {
+    let levels: Vec<Confidence> = fitted.iter().map(|f| confidence(f, psnr)).collect();
+    let (worst, best) = (levels.iter().min()?, levels.iter().max()?);
+    let named = photos.iter().zip(&levels).filter(|(_, l)| *l < best).map(|(p, _)| p.stem.as_str());
+    let named: Vec<&str> = named.collect();
+    let which = if named.is_empty() { String::new() } else { format!(" ({})", named.join(", ")) };
+    Some(format!("{} confidence{which}", worst.name()))
+}
+
+/// What was assumed about the lens: the strongest distortion taken out, and how far the principal
+/// point is from the middle.
+fn lens_figure(o: &RunOutcome) -> Option<String> {
+    let corner = |(photo, camera): (&Photo, &Camera)| {
+        let half = glam::DVec2::new(0.5 * camera.width as f64, 0.5 * camera.height as f64) / camera.fx;
+        (photo.lens().distort(half).length() / half.length() - 1.0, photo.lens())
+    };
+    let all = o.photos.iter().zip(&o.cameras).map(corner);
+    let (share, lens) = all.max_by(|a, b| a.0.abs().total_cmp(&b.0.abs()))?;
+    let camera = o.cameras.first()?;
+    let shift = [camera.cx / camera.width as f64 - 0.5, camera.cy / camera.height as f64 - 0.5];
+    let bend = match lens.is_none() {
+        true => "no distortion seen".to_owned(),
+        false => {
+            format!("k1 {:.3}, k2 {:.3} ({:+.1} % at the corner), taken out", lens.k1, lens.k2, 100.0 * share)
+        }
+    };
+    let centre = match shift.iter().all(|s| s.abs() < 1e-9) {
+        true => String::new(),
+        false => format!("; centre off by {:+.1}, {:+.1} %", 100.0 * shift[0], 100.0 * shift[1]),
+    };
+    (!o.geometry.fitted.is_empty()).then(|| bend + &centre)
+}
+
+/// Figures for the head of the report and the closing table: (label, value).
+fn figures(o: &RunOutcome) -> Vec<(String, String)> {
+    let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
+    // Which, and why, is said when they are chosen, and in run.json.
+    let mut chosen = o.choice.as_ref().map_or(String::new(), |c| {
+        format!("; {} chosen of {}", c.used.len(), c.used.len() + c.left_out.len())
+    });
+    if !o.left_out.is_empty() {
+        let names: Vec<&str> = o.left_out.iter().map(|l| l.photo.as_str()).collect();
+        chosen += &format!("; left out: {}", names.join(", "));
+    }
+    let mut list = vec![
+        ("device".to_owned(), format!("{}{cpu}", o.device.name)),
+        ("photos".to_owned(), sizes(&o.photos) + &chosen),
+        splats_figure(&o.splats, &o.seen),
+        super::fidelity::figure(&o.psnr),
+    ];
+    list.extend(view_dependence_figure(&o.rgb.view_dependence));
+    list.extend(added_figures(o));
+    list.extend(
+        focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| ("focal length".to_owned(), text)),
+    );
+    list.extend(
+        confidence_figure(&o.photos, &o.geometry.fitted, &o.psnr).map(|text| ("cameras".to_owned(), text)),
+    );
+    list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
+    list.push(up_figure(&o.world));
+    list.extend(super::light::figure(&o.photos));
+    let Some(language) = &o.language else { return list };
+    let codes = |k: usize| language.field.levels.get(k).map_or(0, |l| l.codebook.len());
+    list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
+    for a in &language.answers {
+        list.push((format!("“{}”", report::one_line(&a.text)), a.verdict()));
+    }
+    list
+}
+
+/// How many splats there are, and how many of them are guessed.
+fn splats_figure(splats: &Splats, seen: &Seen) -> (String, String) {
+    let guessed = match seen.unseen() {
+        0 => String::new(),
+        n => format!(", {n} of them where no photo looks"),
+    };
+    ("splats".to_owned(), format!("{}{guessed}", splats.len()))
+}
+
+/// The SH degree of the colours, if it is not 0, and what photos say of it.
+fn view_dependence_figure(found: &ViewDependence) -> Option<(String, String)> {
+    let text = match (found.degree, found.trials.last()) {
+        (0, _) => return None,
+        (degree, Some(t)) if t.supported() => {
+            format!("SH degree {degree}: photos left out are shown {:.1} dB better by it", t.gain)
+        }
+        (degree, _) => format!("SH degree {degree}"),
+    };
+    Some(("colours".to_owned(), text))
+}
+
+/// Which way is up, and what says so.
+fn up_figure(world: &World) -> (String, String) {
+    let text = match &world.up {
+        Some(up) => {
+            let evidence: Vec<&str> = up.evidence.iter().map(|e| e.text()).collect();
+            format!("± {:.1}° ({})", up.sigma_degrees, evidence.join(", "))
+        }
+        None => "not known: too few edges and surfaces agree on one direction".to_owned(),
+    };
+    ("up".to_owned(), text)
+}
+
+/// How many photos were used, at which size, and how to change that where they were scaled down.
+fn sizes(photos: &[Photo]) -> String {
+    #[derive(PartialEq)]
+    struct Sizes {
+        working: (usize, usize),
+        original: (usize, usize),
+    }
+    let mut pairs: Vec<Sizes> = Vec::new();
+    for p in photos {
+        let original = (p.original_size.0 as usize, p.original_size.1 as usize);
+        let pair = Sizes { working: (p.image.width, p.image.height), original };
+        if !pairs.contains(&pair) {
+            pairs.push(pair);
+        }
+    }
+    let scaled = |s: &Sizes| s.working != s.original;
+    let one = |s: &Sizes| {
+        let ((w, h), (original_w, original_h)) = (s.working, s.original);
+        match scaled(s) {
+            true => format!("{w} × {h} of {original_w} × {original_h}"),
+            false => format!("{w} × {h}"),
+        }
+    };
+    // More than a few sizes would not fit a line; run.json has them all.
+    let shown: Vec<String> = pairs.iter().take(3).map(one).collect();
+    let more = if pairs.len() > 3 { ", …" } else { "" };
+    let hint = if photos.iter().any(|p| p.zoom() < 1.0) { " (--max-size changes it)" } else { "" };
+    format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
+}
+
+/// The table that ends `splatvk run`; where the scene is of doubtful quality that stands first.
+pub fn closing_table(o: &RunOutcome) -> String {
+    super::fidelity::heading(&o.psnr) + &report::table(&o.stages, o.seconds, &figures(o))
+}
+
+/// Writes `run.json`, `report.html` and `previews/`.
+pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
+    let record = run_record(o).without_folders(o.plan.read().chain([o.plan.output.out.as_path()]))?;
+    record.write(folder)?;
+    let levels: Vec<Vec<_>> =
+        o.frames.iter().map(|f| LEVEL_NAMES.into_iter().zip(f.codes.iter().cloned()).collect()).collect();
+    // What renders are compared with.
+    let targets: Vec<RgbImage> = o.photos.iter().map(Photo::target).collect();
+    let views = o
+        .photos
+        .iter()
+        .enumerate()
+        .map(|(i, p)| ViewShown {
+            name: &p.stem,
+            photo: &targets[i],
+            render: Some(&o.frames[i].rendered.rgb),
+            depth: Some(&o.frames[i].rendered.depth),
+            levels: &levels[i],
+            psnr: o.psnr.get(i).copied(),
+            light: p.light,
+        })
+        .collect();
+    let title = o.plan.output.out.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let report = HtmlReport {
+        title: &title,
+        views,
+        queries: o.language.iter().flat_map(|l| &l.answers).map(shown).collect(),
+        curves: curves(o),
+        space: o.language.as_ref().map(|l| l.field.space.as_str()),
+        scene: Some(scene(&title, &targets, o)),
+        figures: figures(o),
+        run: &record,
+    };
+    report::write_html(folder, &report)?;
+    report::write_previews(folder, &report)
+}
+
+/// Names of codes where there are none.
+static NO_NAMES: CodeNames = Vec::new();
+
+fn scene<'a>(title: &'a str, photos: &'a [RgbImage], o: &'a RunOutcome) -> Scene3d<'a> {
+    Scene3d {
+        title,
+        splats: &o.splats,
+        seen: &o.seen,
+        cameras: &o.cameras,
+        world: &o.world,
+        photos: photos.iter().collect(),
+        language: o.language.as_ref().map(|l| &l.field),
+        names: o.language.as_ref().map_or(&NO_NAMES, |l| &l.names),
+        answers: o.language.iter().flat_map(|l| &l.answers).map(Answers::shown).collect(),
+    }
+}
+
+fn shown(a: &Answers) -> QueryShown<'_> {
+    let answers = a
+        .views
+        .iter()
+        .enumerate()
+        .map(|(view, v)| AnswerShown {
+            view,
+            relevancy: &v.relevancy,
+            mask: Some(&v.mask),
+            score: v.score,
+            found: v.found,
+            level: LEVEL_NAMES[v.level],
+        })
+        .collect();
+    QueryShown { text: &a.text, verdict: a.sentence(), answers }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::RgbImage;
+    use crate::scene::seeded;
+
+    #[test]
+    fn the_focal_length_is_told_per_camera() {
+        let image = RgbImage { width: 64, height: 64, data: vec![[0.5; 3]; 64 * 64] };
+        let photo = |name: &str| crate::photo::from_pixels(name.as_ref(), &image, None, 64).unwrap();
+        let photos = ["a.png", "b.png", "c.png", "d.png"].map(photo);
+        let camera = seeded::small(1, 64, 64, 0, 1).1;
+        let cameras = [300.0, 400.0, 300.0, 400.0].map(|fx| Camera { fx, ..camera.clone() });
+        let fitted = |camera| Fitted { camera, sigmas: [0.002, 0.0, 0.0, 0.0, 0.0], ..Fitted::default() };
+        let text = |of: [usize; 4]| focal_figure(&photos, &cameras, &of.map(fitted)).unwrap();
+        assert_eq!(text([0; 4]), "300.0 px ± 0.20 %");
+        assert_eq!(text([0, 1, 0, 1]), "300.0 px ± 0.20 % (a, c); 400.0 px ± 0.20 % (b, d)");
+        assert_eq!(focal_figure(&photos, &cameras, &[]), None);
+    }
+}
