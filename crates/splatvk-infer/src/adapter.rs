@@ -1,7 +1,7 @@
-//! Adapters: how one file's tensor names, layouts and value ranges map to the roles of a
-//! [`Contract`]. Adapters are data, TOML files: the built-in ones cover the public exports, a
-//! user's own lies beside the model (`adapter.toml` in its folder, or `NAME.toml` beside
-//! `NAME.onnx`) and needs to state only what differs from the built-in one of the same family.
+//! Adapters map the tensor names, layouts and value ranges of a file to the roles of a
+//! [`Contract`]. They are TOML files: the built-in ones cover public exports; a user's adapter lies
+//! beside the model (`adapter.toml` in its folder, or `NAME.toml` beside `NAME.onnx`) and states
+//! only the differences from the built-in one of its family.
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -29,33 +29,33 @@ const BUILT_IN: [(&str, &str); 13] = [
     ("metric-depth", include_str!("adapters/metric-depth.toml")),
 ];
 
-/// How a photo becomes the network's input.
+/// Preprocessing of a photo for a network.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageSpec {
     /// Subtracted from values in [0, 1].
     pub mean: [f32; 3],
-    /// What remains is divided by this.
+    /// Divisor after the subtraction.
     pub std: [f32; 3],
-    /// Length of the longer side, pixels, where the graph leaves it open.
+    /// Length of the longer side, pixels, if the graph does not fix it.
     pub size: usize,
     /// Both sides are multiples of this.
-    #[serde(default = "one")]
+    #[serde(default = "default_multiple")]
     pub multiple: usize,
-    /// How the photo is brought to that size.
+    /// Fit of the photo to that size.
     #[serde(default)]
     pub fit: Fit,
-    /// How it is resampled.
+    /// Resampling filter.
     #[serde(default)]
     pub filter: Filter,
 }
 
-fn one() -> usize {
+fn default_multiple() -> usize {
     1
 }
 
 impl ImageSpec {
-    /// Refuses what no image can be prepared by.
+    /// Refuses values with which no image can be prepared.
     fn check(&self) -> Result<(), String> {
         let numbers = self.mean.iter().chain(&self.std).all(|v| v.is_finite());
         if !numbers || self.std.iter().any(|v| *v <= 0.0) {
@@ -69,22 +69,22 @@ impl ImageSpec {
     }
 }
 
-/// How a photo of another aspect is brought to the input size.
+/// Fit of a photo to an input of another aspect ratio.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Fit {
-    /// Longer side to the size, the rest follows; nothing is cut or added.
+    /// Scales the longer side to the size; nothing is cut or added.
     #[default]
     Resize,
     /// As `Resize`, then black below and to the right (after normalisation).
     Pad,
-    /// Both sides to the size.
+    /// Scales both sides to the size.
     Squash,
     /// As `Resize`, then cut symmetrically to the multiple or the fixed size.
     Crop,
 }
 
-/// How a photo is resampled; all widen when they shrink, as Pillow's do.
+/// Resampling filter; kernels widen with the reduction, as in Pillow.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -98,7 +98,7 @@ pub enum Filter {
     Lanczos,
 }
 
-/// What the program must still apply to an output.
+/// Post-processing that a graph leaves to the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
@@ -143,7 +143,7 @@ impl Activation {
     }
 }
 
-/// A file's own name for a role, or several that occur.
+/// A file's name for a role, or several that occur.
 #[derive(Clone, Debug, Deserialize)]
 #[serde(untagged)]
 enum Names {
@@ -172,15 +172,15 @@ struct GraphSpec {
     image: Option<ImageSpec>,
     #[serde(default)]
     apply: BTreeMap<String, Activation>,
-    /// Roles without which it is another model, although the contract could do without.
+    /// Optional roles of the contract that this model must have.
     #[serde(default)]
     needs: Vec<String>,
     /// A mask decoder that adds the padding point to a prompt itself; most do not.
     pads: Option<bool>,
     /// Least confidence of a usable point, on the scale of the network after `apply`.
     confidence_floor: Option<f64>,
-    /// Where the first pixel's centre is in `intrinsics`: 0.5, or 0 where pixels are counted from
-    /// their centres.
+    /// Coordinate of the first pixel's centre in `intrinsics`: 0.5, or 0 with integer pixel
+    /// centres.
     pixel_centre: Option<f64>,
     #[serde(skip)]
     family: String,
@@ -190,18 +190,18 @@ struct GraphSpec {
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Adapter {
-    /// The kind of model; built-in adapters of the same family fill in what this one leaves out.
+    /// Family of the model; built-in adapters of the same family complete this one.
     #[serde(default)]
     pub family: String,
-    /// Identifies the weights: graphs with different values do not belong together.
+    /// Identifies the weights: graphs with different values are not combined.
     pub checkpoint: Option<String>,
-    /// The weights were never trained: results mean nothing, and nothing is expected of them.
+    /// Whether the weights are untrained: outputs are meaningless and are not checked.
     #[serde(default)]
     pub untrained: bool,
-    /// What the files beside it must hash to, by name; files without an entry may be anything.
+    /// Required sha256 of the files beside it, by name; files without an entry are not checked.
     #[serde(default)]
     pub sha256: BTreeMap<String, String>,
-    /// Where the files were fetched from, by name.
+    /// Addresses that the files were fetched from, by name.
     #[serde(default)]
     pub source: BTreeMap<String, String>,
     #[serde(default)]
@@ -209,8 +209,8 @@ pub struct Adapter {
 }
 
 impl Adapter {
-    /// The adapter of a model file: `NAME.toml` beside it, else `adapter.toml` in its folder, else
-    /// none of its own.
+    /// Reads the adapter of a model file: `NAME.toml` beside it, else `adapter.toml` in its folder,
+    /// else an empty one.
     pub fn of_file(model: &Path) -> Result<Adapter> {
         for path in [model.with_extension("toml"), model.with_file_name("adapter.toml")] {
             if path.is_file() {
@@ -235,8 +235,8 @@ impl Adapter {
         Ok(adapter)
     }
 
-    /// Every description that may fit a graph of this adapter: its own, completed from the built-in
-    /// ones, then those.
+    /// Candidate descriptions of a graph: the adapter's own ones, completed from built-in ones,
+    /// then the built-in ones.
     fn specs(&self) -> Result<Vec<GraphSpec>> {
         let mut built_in = Vec::new();
         for (name, text) in BUILT_IN {
@@ -249,12 +249,12 @@ impl Adapter {
         }
         let mut specs = Vec::new();
         for own in &self.graph {
-            let mut alike =
+            let mut same_family =
                 built_in.iter().filter(|g| g.part == own.part && g.family == self.family).peekable();
-            if alike.peek().is_none() {
+            if same_family.peek().is_none() {
                 specs.push(own.clone());
             }
-            specs.extend(alike.map(|base| own.over(base)));
+            specs.extend(same_family.map(|base| own.completed_from(base)));
         }
         specs.extend(built_in.into_iter().map(|g| GraphSpec {
             family: if self.family.is_empty() { g.family } else { self.family.clone() },
@@ -263,7 +263,8 @@ impl Adapter {
         Ok(specs)
     }
 
-    /// Which part the graph is, and which of its tensors has which role.
+    /// Identifies the part of a graph and the role of each tensor. The error states the nearest
+    /// part.
     pub fn fit(&self, model: &Path, header: &Header) -> Result<Binding> {
         let mut best: Option<Binding> = None;
         let mut nearest: Option<(usize, String)> = None;
@@ -275,7 +276,7 @@ impl Adapter {
                     }
                 }
                 Err(misfit) => {
-                    // Of equally many complaints the contract with more in common is nearer.
+                    // With equally many misfits, the contract with more bound roles is nearer.
                     let distance = 100 * misfit.complaints.len() + 99 - misfit.bound.min(99);
                     if nearest.as_ref().is_none_or(|(d, _)| distance < *d) {
                         let complaints = misfit.complaints.join("; ");
@@ -317,17 +318,17 @@ pub struct Bound {
 /// A graph whose tensors all have roles.
 #[derive(Clone, Debug)]
 pub struct Binding {
-    /// What it does.
+    /// Its part of a model.
     pub part: Part,
-    /// The kind of model.
+    /// Family of the model.
     pub family: String,
     /// Role → tensor.
     pub ports: BTreeMap<&'static str, Bound>,
-    /// How photos become input.
+    /// Preprocessing of photos.
     pub image: Option<ImageSpec>,
-    /// Role → what must still be applied.
+    /// Role → activation that the program applies.
     pub apply: BTreeMap<String, Activation>,
-    /// A mask decoder that adds the padding point to a prompt itself.
+    /// Whether a mask decoder adds the padding point to a prompt itself.
     pub pads: bool,
     /// Least confidence of a usable point, if the adapter states it.
     pub confidence_floor: Option<f64>,
@@ -336,7 +337,8 @@ pub struct Binding {
 }
 
 impl Binding {
-    /// What must still be applied to a role's output. "points" stands for points1 and points2.
+    /// Activation that the program applies to a role's output. "points" stands for points1 and
+    /// points2.
     pub fn activation(&self, role: &str) -> Option<Activation> {
         let stem = role.trim_end_matches(|c: char| c.is_ascii_digit());
         self.apply.get(role).or_else(|| self.apply.get(stem)).copied()
@@ -349,8 +351,8 @@ struct Misfit {
 }
 
 impl GraphSpec {
-    /// This description, completed from another one.
-    fn over(&self, base: &GraphSpec) -> GraphSpec {
+    /// Completes this description from `base`.
+    fn completed_from(&self, base: &GraphSpec) -> GraphSpec {
         let mut spec = base.clone();
         spec.family.clone_from(&self.family);
         spec.names.extend(self.names.clone());

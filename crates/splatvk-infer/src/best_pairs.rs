@@ -1,17 +1,16 @@
-//! Which pairs of many photos are worth keeping: those that show most in common, a bounded number
-//! for every photo, so that time and memory of what follows grow with the number of photos and not
-//! with its square.
+//! Selects the pairs of photos with the largest overlap, a bounded number per photo, so that time
+//! and memory of later steps grow linearly with the number of photos.
 use crate::math::median;
 use crate::scene::{ModelView, PairPointmaps, Pointmap};
 
-/// Partners of every photo that are kept at least, if it has so many: of four photos all.
+/// Smallest number of partners that a photo keeps, if it has so many: all of four photos.
 const PARTNERS: usize = 3;
-/// Pixels looked at: every eighth in both directions, a few thousand of an input of 512 × 384.
+/// Sampling step in both directions, pixels: a few thousand samples of an input of 512 × 384.
 const STRIDE: usize = 8;
-/// A point that far from the surface at its pixel is hidden by it, or the maps disagree.
+/// Relative depth difference to the surface from which a point is occluded or the maps disagree.
 const SAME_SURFACE: f64 = 0.1;
 
-/// Collects pairs and lets go of those that are not among the best, as soon as that is certain.
+/// Collects pairs and drops those that are certain not to be selected.
 pub struct BestPairs {
     /// Width and height of each view.
     sizes: Vec<(usize, usize)>,
@@ -19,7 +18,7 @@ pub struct BestPairs {
 }
 
 impl BestPairs {
-    /// Starts with the views and no pair.
+    /// Creates an empty selection.
     pub fn new(views: &[ModelView]) -> BestPairs {
         BestPairs { sizes: views.iter().map(|v| (v.width, v.height)).collect(), pairs: Vec::new() }
     }
@@ -27,9 +26,9 @@ impl BestPairs {
     /// Adds a pair.
     pub fn add(&mut self, pair: PairPointmaps) {
         let sizes = [self.sizes[pair.first], self.sizes[pair.second]];
-        let common =
-            shown(&pair.x21, &pair.x11, sizes[1], sizes[0]) + shown(&pair.x12, &pair.x22, sizes[0], sizes[1]);
-        self.pairs.push((common, pair));
+        let shared = overlap(&pair.x21, &pair.x11, sizes[1], sizes[0])
+            + overlap(&pair.x12, &pair.x22, sizes[0], sizes[1]);
+        self.pairs.push((shared, pair));
         let scores: Vec<_> = self.pairs.iter().map(|(s, p)| ([p.first, p.second], *s)).collect();
         let keep = best(self.sizes.len(), &scores);
         let mut keep = keep.into_iter();
@@ -39,15 +38,15 @@ impl BestPairs {
     /// The chosen pairs.
     pub fn finish(mut self) -> Vec<PairPointmaps> {
         let scores: Vec<_> = self.pairs.iter().map(|(s, p)| ([p.first, p.second], *s)).collect();
-        let mut keep = enough(self.sizes.len(), &scores).into_iter();
+        let mut keep = without_spare(self.sizes.len(), &scores).into_iter();
         self.pairs.retain(|_| keep.next().unwrap_or(true));
         self.pairs.into_iter().map(|p| p.1).collect()
     }
 }
 
-/// Which pairs are among the best three of one of their views, or in the maximum spanning forest,
-/// which keeps together what holds together. A pair that fails this among some pairs fails it among
-/// more, so pairs may come one after another.
+/// Marks pairs that are among the best three of one of their views or in the maximum spanning
+/// forest, which preserves connectivity. A pair rejected among some pairs is rejected among more,
+/// so pairs may be added one by one.
 fn best(views: usize, pairs: &[([usize; 2], f64)]) -> Vec<bool> {
     let order = best_first(pairs);
     let mut keep = forest(views, pairs, &order);
@@ -61,9 +60,9 @@ fn best(views: usize, pairs: &[([usize; 2], f64)]) -> Vec<bool> {
     keep
 }
 
-/// Of the best pairs those without which a view would have fewer than three, or views would fall
-/// apart: a view that many others count among their best would have many more.
-fn enough(views: usize, pairs: &[([usize; 2], f64)]) -> Vec<bool> {
+/// Drops spare pairs, worst first: both views keep three partners, and the spanning forest stays.
+/// Without this step, a view that is a best partner of many others would keep many more.
+fn without_spare(views: usize, pairs: &[([usize; 2], f64)]) -> Vec<bool> {
     let mut keep = vec![true; pairs.len()];
     let mut partners = vec![0; views];
     pairs.iter().flat_map(|p| p.0).for_each(|v| partners[v] += 1);
@@ -86,7 +85,7 @@ fn best_first(pairs: &[([usize; 2], f64)]) -> Vec<usize> {
     order
 }
 
-/// Which pairs are in the maximum spanning forest; `order` is best first.
+/// Marks the pairs of the maximum spanning forest; `order` is best first.
 fn forest(views: usize, pairs: &[([usize; 2], f64)], order: &[usize]) -> Vec<bool> {
     let mut tree: Vec<usize> = (0..views).collect();
     let mut keep = vec![false; pairs.len()];
@@ -98,18 +97,13 @@ fn forest(views: usize, pairs: &[([usize; 2], f64)], order: &[usize]) -> Vec<boo
     keep
 }
 
-/// How much of one view the other shows: the share of pixels of `seen` whose points, given in the
-/// other's camera, fall into its picture on the surface `base` that it sees, each counting by its
-/// confidence against the mean of that surface.
-fn shown(seen: &Pointmap, base: &Pointmap, seen_size: (usize, usize), size: (usize, usize)) -> f64 {
-    let samples = |(w, h): (usize, usize)| {
-        (STRIDE / 2..h)
-            .step_by(STRIDE)
-            .flat_map(move |y| (STRIDE / 2..w).step_by(STRIDE).map(move |x| (x, y)))
-    };
+/// Overlap of two views: share of the pixels of `seen` whose points, in the other camera's frame,
+/// project onto the surface `base` of that camera. Each is weighted by its confidence relative to
+/// the mean of `base`, at most 1.
+fn overlap(seen: &Pointmap, base: &Pointmap, seen_size: (usize, usize), size: (usize, usize)) -> f64 {
     let (width, height) = (size.0 as f64, size.1 as f64);
-    let (mut focals, mut sure, mut count) = (Vec::new(), 0.0, 0.0f64);
-    for (x, y) in samples(size) {
+    let (mut focals, mut confidence, mut count) = (Vec::new(), 0.0, 0.0f64);
+    for (x, y) in sample_grid(size) {
         let p = base.point(y * size.0 + x);
         let (u, v) = (x as f64 + 0.5 - 0.5 * width, y as f64 + 0.5 - 0.5 * height);
         let slope = [p.x / p.z, p.y / p.z];
@@ -117,14 +111,14 @@ fn shown(seen: &Pointmap, base: &Pointmap, seen_size: (usize, usize), size: (usi
         if p.z > 0.0 && focal.is_finite() {
             focals.push(focal);
         }
-        sure += f64::from(base.confidence[y * size.0 + x]) - 1.0;
+        confidence += f64::from(base.confidence[y * size.0 + x]) - 1.0;
         count += 1.0;
     }
     let Some(focal) = median(&mut focals) else { return 0.0 };
-    // Where no point is surer than another, all count alike.
-    let mean = (sure / count).max(1e-3);
+    // If all confidences are 1, all weights are 1.
+    let mean = (confidence / count).max(1e-3);
     let (mut sum, mut all) = (0.0, 0.0f64);
-    for (x, y) in samples(seen_size) {
+    for (x, y) in sample_grid(seen_size) {
         all += 1.0;
         let k = y * seen_size.0 + x;
         let p = seen.point(k);
@@ -139,14 +133,19 @@ fn shown(seen: &Pointmap, base: &Pointmap, seen_size: (usize, usize), size: (usi
     sum / all.max(1.0)
 }
 
+/// Every [`STRIDE`]-th pixel in both directions.
+fn sample_grid((w, h): (usize, usize)) -> impl Iterator<Item = (usize, usize)> {
+    (STRIDE / 2..h).step_by(STRIDE).flat_map(move |y| (STRIDE / 2..w).step_by(STRIDE).map(move |x| (x, y)))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::math::Random;
 
     #[test]
-    fn each_view_keeps_its_best_partners_and_what_holds_together_stays_so() {
-        // Two groups of five, joined by one poor pair.
+    fn best_keeps_partners_and_connectivity() {
+        // Two groups of five; pairs between them have little overlap.
         let mut rng = Random::new(2);
         let mut pairs = Vec::new();
         for i in 0..10usize {
@@ -166,7 +165,7 @@ mod tests {
             assert!(own[..3].iter().all(|p| kept.contains(p)), "{v}");
         }
         assert!(kept.len() <= 3 * 10 + 9);
-        // One after another they leave the same.
+        // Adding pairs one by one selects the same.
         let mut some: Vec<([usize; 2], f64)> = Vec::new();
         for p in &pairs {
             some.push(*p);
@@ -174,9 +173,9 @@ mod tests {
             some.retain(|_| keep.next().unwrap());
         }
         assert_eq!(some, kept);
-        // In the end each view has three partners still, and no pair can go without that it would
-        // have fewer.
-        let left = enough(10, &kept);
+        // At the end each view still has three partners, and only pairs of the spanning tree are
+        // spare.
+        let left = without_spare(10, &kept);
         let left: Vec<_> = kept.iter().zip(&left).filter(|p| *p.1).map(|p| p.0.0).collect();
         let partners = |v: usize| left.iter().filter(|p| p.contains(&v)).count();
         assert!((0..10).all(|v| partners(v) >= 3), "{left:?}");
@@ -187,9 +186,9 @@ mod tests {
     }
 
     #[test]
-    fn what_two_views_show_in_common_is_measured_by_their_points() {
-        // A plane 4 ahead of two cameras of 90°, the second moved to the right by a share of what
-        // they see.
+    fn overlap_matches_shared_area() {
+        // A plane at depth 4 before two cameras of 90°, the second moved to the right by a share of
+        // the field of view.
         let (w, h) = (128usize, 96);
         let plane = |shift: f32| Pointmap {
             points: (0..w * h)
@@ -202,14 +201,14 @@ mod tests {
         };
         let base = plane(0.0);
         for (shift, share) in [(0.0, 1.0), (2.0, 0.75), (6.0, 0.25), (9.0, 0.0)] {
-            let found = shown(&plane(shift), &base, (w, h), (w, h));
+            let found = overlap(&plane(shift), &base, (w, h), (w, h));
             assert!((found - share).abs() < 0.04, "{shift}: {found}");
         }
-        // Points of little confidence, and points behind the surface, show nothing.
+        // Points of low confidence or behind the surface do not count.
         let unsure = Pointmap { confidence: vec![1.01; w * h], ..plane(0.0) };
-        assert!(shown(&unsure, &base, (w, h), (w, h)) < 0.01);
+        assert!(overlap(&unsure, &base, (w, h), (w, h)) < 0.01);
         let mut far = plane(0.0);
         far.points.iter_mut().for_each(|p| *p = p.map(|c| 1.5 * c));
-        assert_eq!(shown(&far, &base, (w, h), (w, h)), 0.0);
+        assert_eq!(overlap(&far, &base, (w, h), (w, h)), 0.0);
     }
 }

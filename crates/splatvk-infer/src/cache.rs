@@ -1,8 +1,7 @@
-//! Outputs of networks on disk, by the content of the photo and of the model: a second run computes
-//! none of them again.
+//! Disk cache of network outputs, keyed by the content of photo and model.
 //!
-//! The folder is a cache: anything odd about a file, and it is computed and written again. The
-//! least recently used files go when it grows beyond its capacity.
+//! A damaged file is computed and written again. The least recently used files are removed when the
+//! folder exceeds its capacity.
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -12,41 +11,41 @@ use crate::Result;
 use crate::files::home;
 use crate::files::{self, content_hash, sha256};
 
-/// Bytes that the folder may hold: the pointmaps and descriptors of a dozen scenes, or the masks of
+/// Capacity of the folder, bytes: the pointmaps and descriptors of a dozen scenes, or the masks of
 /// hundreds.
 const CAPACITY: u64 = 4 << 30;
 
 /// Extension of the files.
 const EXTENSION: &str = "f32";
 
-/// Identifies a result by everything that it depends on.
+/// Hash of everything that a result depends on.
 pub struct OutputKey {
     kind: &'static str,
     digest: Sha256,
 }
 
 impl OutputKey {
-    /// A kind of result; the word is part of the file name.
+    /// Begins the key of a kind of result; `kind` is part of the file name.
     pub fn new(kind: &'static str) -> OutputKey {
-        // Another version may prepare photos otherwise.
+        // Another version may preprocess photos differently.
         OutputKey { kind, digest: Sha256::new() }.text(kind).text(env!("CARGO_PKG_VERSION"))
     }
 
-    /// Depends on a text.
+    /// Adds a text.
     pub fn text(mut self, text: &str) -> OutputKey {
         self.digest.update((text.len() as u64).to_le_bytes());
         self.digest.update(text);
         self
     }
 
-    /// Depends on values.
+    /// Adds values.
     pub fn values<T: bytemuck::NoUninit>(mut self, values: &[T]) -> OutputKey {
         self.digest.update((values.len() as u64).to_le_bytes());
         self.digest.update(bytemuck::cast_slice::<T, u8>(values));
         self
     }
 
-    /// 16 hexadecimal digits.
+    /// First 16 hexadecimal digits of the hash.
     pub fn short(self) -> String {
         let mut hash = sha256(&self.digest.finalize());
         hash.truncate(16);
@@ -59,33 +58,33 @@ impl OutputKey {
     }
 }
 
-/// Where answers are kept.
+/// Folder of the cache.
 pub fn folder() -> Result<PathBuf> {
     Ok(home()?.join("cache"))
 }
 
-/// What is kept in that folder, with sizes in bytes.
+/// Files of the cache, with sizes in bytes.
 pub fn files(folder: &Path) -> Vec<(PathBuf, u64)> {
     files::in_folder(folder, EXTENSION)
 }
 
-/// `compute`, or what it gave the last time with the same key.
+/// Returns the cached result of `key`, else computes and stores it.
 pub(super) fn remember(key: OutputKey, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<Vec<f32>> {
-    // Without a folder of its own the program keeps nothing.
+    // Without a home folder nothing is cached.
     let Ok(file) = key.file() else { return compute() };
     if let Some(body) = files::read_with_checksum(&file).filter(|b| b.len() % 4 == 0) {
         return Ok(bytemuck::pod_collect_to_vec(&body));
     }
     let values = compute()?;
-    // Not being able to keep it costs time only.
+    // A failed write costs only time.
     if files::write_with_checksum(&file, bytemuck::cast_slice(&values)).is_ok() {
         files::prune(&file, EXTENSION, CAPACITY);
     }
     Ok(values)
 }
 
-/// sha256 of a file, remembered across processes by its place, size and time of change: hashing
-/// gigabytes takes seconds.
+/// sha256 of a file, cached across processes by path, size and time of change: hashing gigabytes
+/// takes seconds.
 pub(super) fn fingerprint(path: &Path) -> std::io::Result<String> {
     let meta = std::fs::metadata(path)?;
     let age = meta.modified()?.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
@@ -106,23 +105,23 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_damaged_file_is_computed_again() {
+    fn remember_damaged_file_is_recomputed() {
         let key = || OutputKey::new("test").text("damaged").values(&[std::process::id()]);
         let file = key().file().unwrap();
         let count = std::cell::Cell::new(0);
-        let ask = || {
+        let cached = || {
             remember(key(), || {
                 count.set(count.get() + 1);
                 Ok(vec![1.0, 2.0])
             })
         };
-        assert_eq!(ask().unwrap(), [1.0, 2.0]);
-        assert_eq!(ask().unwrap(), [1.0, 2.0]);
+        assert_eq!(cached().unwrap(), [1.0, 2.0]);
+        assert_eq!(cached().unwrap(), [1.0, 2.0]);
         assert_eq!(count.get(), 1, "the second answer comes from the file");
         let mut bytes = std::fs::read(&file).unwrap();
         bytes[70] ^= 1;
         std::fs::write(&file, &bytes).unwrap();
-        assert_eq!(ask().unwrap(), [1.0, 2.0]);
+        assert_eq!(cached().unwrap(), [1.0, 2.0]);
         assert_eq!(count.get(), 2);
         std::fs::remove_file(&file).unwrap();
         assert_ne!(

@@ -1,10 +1,10 @@
-//! The networks that splatvk knows and does not ship, and where their files come from:
-//! `catalogue.toml`, the one manifest of what `models list` names and `models fetch` gets.
+//! Catalogue of the networks that splatvk supports and does not ship, with the sources of their
+//! files: `catalogue.toml`, read by `models list` and `models fetch`.
 use std::sync::OnceLock;
 
 use serde::{Deserialize, Serialize};
 
-/// What a model does in a run.
+/// Task of a model in a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -37,39 +37,39 @@ impl Task {
     }
 }
 
-/// A network that splatvk knows and does not ship.
+/// A network that splatvk supports and does not ship.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CatalogueEntry {
-    /// Folder or beginning of the file names under which it is looked for.
+    /// Name of its folder, or prefix of its file names.
     pub id: String,
-    /// What people call it.
+    /// Its common name.
     pub name: String,
-    /// What it does.
+    /// Its main task.
     #[serde(rename = "role")]
     pub task: Task,
-    /// What it can do besides.
+    /// Its other tasks.
     #[serde(default, rename = "also")]
     pub other_tasks: Vec<Task>,
-    /// What `--init`, `--matcher`, `--masks` or `--features` call it.
+    /// Its name in `--init`, `--matcher`, `--masks` or `--features`.
     pub family: String,
     /// "paper", "open".
     pub packs: Vec<String>,
-    /// Of code and weights.
+    /// Licence of code and weights.
     pub licence: String,
     /// The licence forbids commercial use.
     #[serde(default)]
     pub non_commercial: bool,
     /// Size of its float32 files.
     pub megabytes: u32,
-    /// Where it is from.
+    /// Address of its project.
     pub source: String,
-    /// What writes its ONNX files.
+    /// Script or address that gives its ONNX files.
     pub export: String,
-    /// Public ONNX files that fit as they are; none where there are none.
+    /// Public ONNX files that fit unchanged; may be empty.
     #[serde(default)]
     pub files: Vec<Source>,
-    /// How the export script makes the files where no public ones fit.
+    /// Export of the files, if no public ones fit.
     pub recipe: Option<Recipe>,
 }
 
@@ -79,12 +79,11 @@ pub struct CatalogueEntry {
 pub struct Source {
     /// Its address.
     pub from: String,
-    /// Its name where it is put.
+    /// Its local file name.
     pub name: String,
-    /// Its size, where it is known.
+    /// Its size, if known.
     pub bytes: Option<u64>,
-    /// Its content, where it is known; otherwise the first download decides, which is kept in the
-    /// model's adapter.
+    /// Its sha256, if known; else that of the first download is pinned in the model's adapter.
     pub sha256: Option<String>,
 }
 
@@ -94,7 +93,7 @@ pub struct Source {
 pub struct Recipe {
     /// File in `tools/export`.
     pub script: String,
-    /// What it is told besides `--out`; it runs in the folder of the weights.
+    /// Its arguments besides `--out`; it runs in the folder of the weights.
     #[serde(default)]
     pub arguments: Vec<String>,
     /// Checkpoints that it reads.
@@ -102,27 +101,27 @@ pub struct Recipe {
     /// Python packages, beside those of every script ([`common_packages`]).
     #[serde(default)]
     pub packages: Vec<String>,
-    /// Packages whose own requirements an export does without.
+    /// Packages that are installed without their requirements.
     #[serde(default)]
     pub bare_packages: Vec<String>,
-    /// Git repository with the network's code, where no package holds it.
+    /// Git repository with the network's code, if no package has it.
     pub code: Option<String>,
 }
 
 impl CatalogueEntry {
-    /// The most bytes that a file of it may have where its size is not known: sizes above are of
-    /// all files, as an export writes them, and a checkpoint may hold what training needed besides.
+    /// Largest size of a file of unknown size, bytes: `megabytes` counts the exported files, and a
+    /// checkpoint may also contain the state of training.
     pub fn ceiling(&self) -> u64 {
         u64::from(self.megabytes) * 2_000_000 + (64 << 20)
     }
 
-    /// Whether it does this, mainly or besides.
+    /// Whether `task` is its main task or one of the others.
     pub fn does(&self, task: Task) -> bool {
         self.task == task || self.other_tasks.contains(&task)
     }
 }
 
-/// The text of `catalogue.toml`.
+/// Contents of `catalogue.toml`.
 #[derive(Default, Deserialize)]
 struct Catalogue {
     common_packages: Vec<String>,
@@ -132,7 +131,7 @@ struct Catalogue {
 fn read() -> &'static Catalogue {
     static KNOWN: OnceLock<Catalogue> = OnceLock::new();
     KNOWN.get_or_init(|| {
-        // A test reads the same text; a mistake in it cannot reach users.
+        // A test parses the same text, so an error cannot reach users.
         toml::from_str(include_str!("catalogue.toml")).unwrap_or_default()
     })
 }

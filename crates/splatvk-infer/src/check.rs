@@ -1,5 +1,5 @@
-//! Runs an installed network on a built-in input and holds it to its contract; measures time and
-//! memory on the way.
+//! Runs an installed network on built-in images, checks it against its contract, and measures time
+//! and memory.
 use std::path::Path;
 use std::time::Instant;
 
@@ -15,19 +15,18 @@ use crate::progress::{Silent, peak_memory, reset_peak_memory};
 use crate::scene::{Affine, Image, RgbImage};
 use crate::{Error, Result};
 
-/// Largest difference to the reference, relative to its largest value: what float32 sums in another
-/// order may cost.
+/// Largest difference to the reference, relative to its largest value: the effect of another order
+/// of float32 sums.
 const TOLERANCE: f32 = 1e-3;
 
-/// What one step took.
+/// Measurements of one step.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct Measured {
-    /// What was done.
+    /// Description of the step.
     pub step: String,
     /// Wall seconds.
     pub seconds: f64,
-    /// Peak resident memory of the process during the step, bytes; 0 where the system does not
-    /// tell.
+    /// Peak resident memory of the process during the step, bytes; 0 if unknown.
     pub peak_memory: u64,
     /// Largest difference to PyTorch's answer, relative to its largest value.
     pub error: Option<f32>,
@@ -42,9 +41,9 @@ fn measured<T>(step: String, steps: &mut Vec<Measured>, work: impl FnOnce() -> R
     Ok(done)
 }
 
-/// Repeats the reference of every graph that has one, then the model's task on two built-in
-/// pictures. An error names the file and what it did wrong. For a model of an uncached registry
-/// ([`super::Registry::uncached`]): the steps are measured.
+/// Repeats the reference run of every graph that has one, then runs the model's tasks on two
+/// built-in images. An error names the file and the fault. The registry must be uncached
+/// ([`super::Registry::uncached`]), since the steps are measured.
 pub fn check(model: &Installed) -> Result<Vec<Measured>> {
     let mut steps = Vec::new();
     for graph in model.graphs.values() {
@@ -61,7 +60,7 @@ pub fn check(model: &Installed) -> Result<Vec<Measured>> {
     for task in &model.tasks {
         match task {
             Task::Geometry => {
-                // Networks that see all photos at once may ask for a certain number.
+                // Multi-view networks may have a fixed number of photos.
                 let count = model.graphs.values().find_map(|g| g.fixed("images", "N")).unwrap_or(2);
                 let some: Vec<Photo> = photos.iter().cycle().take(count).cloned().collect();
                 measured(format!("geometry of {count} photos"), &mut steps, || {
@@ -74,7 +73,7 @@ pub fn check(model: &Installed) -> Result<Vec<Measured>> {
             }
             Task::Masks => masks(model, &photos[0].image, &mut steps)?,
             Task::Features => features(model, &photos[0].image, &mut steps)?,
-            // Runs with the features, or is what the geometry says.
+            // Texts run with the features; depth comes from the geometry.
             Task::Text => {}
             Task::Depth if model.tasks.contains(&Task::Geometry) => {}
             Task::Depth => {
@@ -108,8 +107,8 @@ fn repeat(file: &GraphFile, reference: &Path) -> Result<f32> {
     let mut worst = 0f32;
     for (role, bound) in &file.binding.ports {
         let Some(wanted) = arrays.get(&format!("out.{}", bound.name)) else { continue };
-        // Layouts that differ from the contract's are for the toy graphs of the tests; exports use
-        // the contract's own, up to the channel axis of warps.
+        // Only the toy graphs of the tests have other layouts than the contract; exports use the
+        // contract's, up to the channel axis of warps.
         let given = outputs.take(role)?;
         let raw = super::graph::relayout(
             given,
@@ -141,7 +140,7 @@ fn repeat(file: &GraphFile, reference: &Path) -> Result<f32> {
     Ok(worst)
 }
 
-/// The reference after what the program applies to the graph's output.
+/// Applies the activation of a role to its reference values.
 fn activated(file: &GraphFile, role: &str, data: Vec<f32>) -> Vec<f32> {
     let mut tensor = super::Tensor { shape: vec![data.len()], data };
     if let Some(activation) = file.binding.activation(role) {
@@ -179,40 +178,43 @@ fn features(model: &Installed, image: &RgbImage, steps: &mut Vec<Measured>) -> R
 
 /// Two views of a textured wall and a nearer box, a step apart.
 fn pictures() -> Vec<Photo> {
+    (0..2).map(picture).collect()
+}
+
+fn picture(k: usize) -> Photo {
     let (width, height) = (640usize, 480usize);
-    let one = |k: usize| {
-        // Smooth pseudo-random texture; the wall moves by 20 pixels, the box before it by 60.
-        let colour = |x: f64, y: f64, seed: f64| {
-            let wave = |a: f64, b: f64| 0.5 + 0.5 * ((x * a + seed).sin() * (y * b - seed).cos());
-            [wave(0.11, 0.07) as f32, wave(0.05, 0.13) as f32, wave(0.23, 0.19) as f32]
-        };
-        let pixel = |p: usize| {
-            let (x, y) = ((p % width) as f64, (p / width) as f64);
-            let near = x + 60.0 * k as f64;
-            let inside = (260.0..420.0).contains(&near) && (160.0..330.0).contains(&y);
-            if inside { colour(near, y, 3.0) } else { colour(x + 20.0 * k as f64, y, 1.0) }
-        };
-        let image = RgbImage { width, height, data: (0..width * height).map(pixel).collect() };
-        Photo {
-            path: format!("built-in {k}").into(),
-            stem: format!("built-in {k}"),
-            original_size: (width as u32, height as u32),
-            to_working: Affine::IDENTITY,
-            border: PlainBorder::default(),
-            exif_focal: None,
-            fine: None,
-            lost_pixels: 0,
-            coverage: None,
-            overlay: None,
-            masked: false,
-            notes: Vec::new(),
-            straightened: None,
-            turn: Default::default(),
-            camera_model: None,
-            gravity: None,
-            light: crate::photo::Light::NONE,
-            image,
-        }
+    // The wall moves by 20 pixels, the box before it by 60.
+    let pixel = |p: usize| {
+        let (x, y) = ((p % width) as f64, (p / width) as f64);
+        let near = x + 60.0 * k as f64;
+        let inside = (260.0..420.0).contains(&near) && (160.0..330.0).contains(&y);
+        if inside { texture(near, y, 3.0) } else { texture(x + 20.0 * k as f64, y, 1.0) }
     };
-    (0..2).map(one).collect()
+    let image = RgbImage { width, height, data: (0..width * height).map(pixel).collect() };
+    Photo {
+        path: format!("built-in {k}").into(),
+        stem: format!("built-in {k}"),
+        original_size: (width as u32, height as u32),
+        to_working: Affine::IDENTITY,
+        border: PlainBorder::default(),
+        exif_focal: None,
+        fine: None,
+        lost_pixels: 0,
+        coverage: None,
+        overlay: None,
+        masked: false,
+        notes: Vec::new(),
+        straightened: None,
+        turn: Default::default(),
+        camera_model: None,
+        gravity: None,
+        light: crate::photo::Light::NONE,
+        image,
+    }
+}
+
+/// Smooth pseudo-random colour.
+fn texture(x: f64, y: f64, seed: f64) -> [f32; 3] {
+    let wave = |a: f64, b: f64| 0.5 + 0.5 * ((x * a + seed).sin() * (y * b - seed).cos());
+    [wave(0.11, 0.07) as f32, wave(0.05, 0.13) as f32, wave(0.23, 0.19) as f32]
 }

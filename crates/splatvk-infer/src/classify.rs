@@ -1,5 +1,5 @@
-//! Class probabilities of an image region: EfficientNet-Lite0 (Tan 2020) on the region cut out of
-//! its surroundings.
+//! Class probabilities of an image region: EfficientNet-Lite0 (Tan 2020) on a crop of the region
+//! without its surroundings.
 use rayon::prelude::*;
 
 use super::registry::{PackFileKind, Registry};
@@ -12,7 +12,7 @@ use crate::{Error, Result};
 pub const CLASSES: usize = 1000;
 /// Side of the network's input, pixels.
 const SIDE: usize = 224;
-/// What surrounds a region: the value that the network's own normalisation maps to zero.
+/// Background of a crop: the value that the network's normalisation maps to zero.
 const GREY: f32 = 127.0 / 255.0;
 /// Crops per forward pass.
 const BATCH: usize = 8;
@@ -40,11 +40,11 @@ impl Classifier {
     /// [count, 1000] class probabilities of the regions `0..count` of `labels`; a zero row for a
     /// region without pixels.
     ///
-    /// A region is judged from one crop: the square around its bounding box with everything else
-    /// grey. On breakfast (40 perfect masks, 840 Felzenszwalb segments, 416 masks of the graph
-    /// segmentation) nothing else named more regions right: wider crops, blurred, white, black or
-    /// dimmed surroundings, the mirrored crop, filled holes or a grown mask, averages of these, and
-    /// the larger Lite1 and Lite2.
+    /// A region is classified from one crop: the square around its bounding box with everything
+    /// else grey. On breakfast (40 perfect masks, 840 Felzenszwalb segments, 416 masks of the graph
+    /// segmentation) no alternative named more regions correctly: wider crops, blurred, white,
+    /// black or dimmed surroundings, the mirrored crop, filled holes or a grown mask, averages of
+    /// these, and the larger Lite1 and Lite2.
     pub fn regions(
         &mut self,
         image: &RgbImage,
@@ -100,8 +100,8 @@ pub(super) fn extents(labels: &Image<i32>, count: usize) -> Vec<Option<Extent>> 
     found
 }
 
-/// The region in the middle of a square of one value, resized to the network's input, [3, to, to]
-/// in [0, 1].
+/// The region in the centre of a uniform square, resized to the network's input, [3, to, to] in [0,
+/// 1].
 pub(super) fn crop(
     image: &RgbImage,
     labels: &Image<i32>,
@@ -116,14 +116,14 @@ pub(super) fn crop(
     let columns = taps(left, side, to, e.x0, e.x1);
     let rows = taps(top, side, to, e.y0, e.y1);
     // Separable: first along x for every source row of the box, then along y.
-    let mut squeezed = vec![[0f32; 3]; (e.y1 - e.y0) * to];
+    let mut by_column = vec![[0f32; 3]; (e.y1 - e.y0) * to];
     for y in e.y0..e.y1 {
         for (x, (start, weights)) in columns.iter().enumerate() {
-            let out = &mut squeezed[(y - e.y0) * to + x];
+            let out = &mut by_column[(y - e.y0) * to + x];
             for (k, w) in weights.iter().enumerate() {
                 if labels.at(start + k, y) == label {
                     let c = image.at(start + k, y);
-                    // Relative to the surroundings, so that whatever is left out counts as such.
+                    // Relative to the background, so that omitted pixels count as background.
                     (0..3).for_each(|i| out[i] += w * (c[i] - around));
                 }
             }
@@ -133,7 +133,7 @@ pub(super) fn crop(
     for (y, (start, weights)) in rows.iter().enumerate() {
         for x in 0..to {
             for (k, w) in weights.iter().enumerate() {
-                let c = squeezed[(start + k - e.y0) * to + x];
+                let c = by_column[(start + k - e.y0) * to + x];
                 (0..3).for_each(|i| planes[(i * to + y) * to + x] += w * c[i]);
             }
         }
@@ -147,14 +147,14 @@ pub(super) fn crop(
 fn taps(start: f32, side: usize, pixels: usize, from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let scale = side as f32 / pixels as f32;
     let reach = scale.max(1.0);
-    let one = |i: usize| {
+    let taps = (0..pixels).map(|i| {
         let centre = start + (i as f32 + 0.5) * scale;
         let first = ((centre - reach - 0.5).ceil().max(0.0) as usize).clamp(from, to);
         let last = ((centre + reach - 0.5).floor().max(-1.0) + 1.0) as usize;
         let weight = |j: usize| (1.0 - ((j as f32 + 0.5) - centre).abs() / reach).max(0.0) / reach;
         (first, (first..last.clamp(first, to)).map(weight).collect())
-    };
-    (0..pixels).map(one).collect()
+    });
+    taps.collect()
 }
 
 #[cfg(test)]
@@ -162,7 +162,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_crop_centres_the_region_on_grey() {
+    fn crop_centres_region_on_grey() {
         let (width, height) = (40, 30);
         let mut image = RgbImage { width, height, data: vec![[1.0, 0.0, 0.0]; width * height] };
         let mut labels = Image::filled(width, height, -1);
@@ -176,10 +176,10 @@ mod tests {
         assert_eq!((e.x0, e.y0, e.x1, e.y1), (5, 10, 25, 14));
         assert!(extents(&labels, 3)[0].is_none() && extents(&labels, 2).iter().all(Option::is_none));
         let planes = crop(&image, &labels, 2, e, SIDE, GREY);
-        let at = |c: usize, x: usize, y: usize| planes[(c * SIDE + y) * SIDE + x];
+        let value = |c: usize, x: usize, y: usize| planes[(c * SIDE + y) * SIDE + x];
         for (c, want) in [0.2, 0.4, 0.6].into_iter().enumerate() {
-            assert!((at(c, 112, 112) - want).abs() < 1e-4, "{}", at(c, 112, 112));
-            assert!((at(c, 112, 30) - GREY).abs() < 1e-6 && (at(c, 112, 200) - GREY).abs() < 1e-6);
+            assert!((value(c, 112, 112) - want).abs() < 1e-4, "{}", value(c, 112, 112));
+            assert!((value(c, 112, 30) - GREY).abs() < 1e-6 && (value(c, 112, 200) - GREY).abs() < 1e-6);
         }
         // The region fills a fifth of the square: its share of the green plane's departure from
         // grey is that fifth.
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn weights_of_a_reduction_sum_to_one_inside() {
+    fn taps_sum_to_one_inside() {
         for (side, from, to) in [(1000, 0, 1000), (224, 0, 224), (60, 0, 60)] {
             let all = taps(0.0, side, SIDE, from, to);
             for (_, weights) in &all[20..200] {

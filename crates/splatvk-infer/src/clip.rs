@@ -21,11 +21,11 @@ use crate::{Error, Result};
 
 /// Crops per forward pass: ViT-B/16 takes 0.2 GB for eight, and more are no faster on a CPU.
 const BATCH: usize = 8;
-/// Tokens of a text where the graph leaves the number open: CLIP's context.
+/// Tokens of a text if the graph does not fix their number: CLIP's context.
 const CONTEXT: usize = 77;
 
-/// CLIP's vocabulary, and what its own tokenizer makes of some texts (open_clip 3.3, less the start
-/// and end marks).
+/// Size of CLIP's vocabulary, and the ids that CLIP's tokenizer gives for some texts (open_clip
+/// 3.3, without start and end marks).
 const VOCABULARY: usize = 49408;
 const GOLDEN: [(&str, &[i64]); 12] = [
     ("lemon", &[7184]),
@@ -59,8 +59,8 @@ impl Clip {
         if let (Some(dense), Some(dim)) =
             (model.graphs.get_mut(&Part::DenseFeatures), text.fixed("embedding", "D"))
         {
-            // A picture of fixed size is as long as it is wide or high: only the texts tell which
-            // axis holds the features.
+            // With a fixed image size several layouts may fit; the width of text embeddings
+            // determines the feature axis.
             dense.fix_axis("features", "D", dim);
         }
         let (visual, axis) = match model.graph(Part::ImageTower) {
@@ -74,12 +74,11 @@ impl Clip {
             return Err(towers_differ(&visual, &text, &format!("embeddings of {a} and {b} values")));
         }
         let tokenizer = tokenizer(&model)?;
-        // The space is the weights: features may be compared with texts only when both came from
-        // them.
+        // The weights define the space: features and texts of other weights are not comparable.
         let space =
             format!("{}:{}", model.family, OutputKey::new("space").model(&visual)?.model(&text)?.short());
         let mut clip = Clip { model, space, tokenizer, image: None, text: None, dim: 0 };
-        clip.tokens_are_right(&text)?;
+        clip.check_tokens(&text)?;
         clip.dim = match widths.0.or(widths.1) {
             Some(dim) => dim,
             None => clip.embed_texts(&["a"])?.len(),
@@ -120,9 +119,8 @@ impl Clip {
         Err(towers_differ(visual, text, "a red, a green and a blue square are not nearest to their names"))
     }
 
-    /// A tokenizer with CLIP's vocabulary must give CLIP's ids; another vocabulary is its model's
-    /// own affair.
-    fn tokens_are_right(&self, tower: &GraphFile) -> Result<()> {
+    /// Checks that a tokenizer with CLIP's vocabulary gives CLIP's ids; others are not checked.
+    fn check_tokens(&self, tower: &GraphFile) -> Result<()> {
         if self.tokenizer.get_vocab_size(true) != VOCABULARY {
             return Ok(());
         }
@@ -174,7 +172,7 @@ impl Clip {
         fixed.unwrap_or(CONTEXT).max(2)
     }
 
-    /// Every region from a crop of its own, on black.
+    /// Embeds every region from its own crop on black.
     fn crop_features(
         &mut self,
         image: &RgbImage,
@@ -204,7 +202,7 @@ impl Clip {
                     planes
                 })
                 .collect();
-            // A graph of a fixed batch gets zeros for what is missing.
+            // A fixed batch is filled up with zeros.
             let rows = if graph.file.fixed("image", "B").is_some() { batch } else { regions.len() };
             crops.resize(rows * 3 * side * side, 0.0);
             let embedding = graph
@@ -217,7 +215,7 @@ impl Clip {
         Ok(all)
     }
 
-    /// Every region as the mean of its pixels' features.
+    /// Embeds every region as the sum of its pixels' features, which the caller normalises.
     fn pixel_features(&mut self, image: &RgbImage, labels: &Image<i32>, count: usize) -> Result<Vec<f32>> {
         let dim = self.dim;
         let graph = self.visual()?;
@@ -235,12 +233,9 @@ impl Clip {
             };
             let at = [(p % labels.width) as f64 + 0.5, (p / labels.width) as f64 + 0.5];
             let [u, v] = ready.from_photo.apply(at);
-            let cell = |u: f64, cells: usize, pixels: usize| {
-                ((u * cells as f64 / pixels as f64) as usize).min(cells - 1)
-            };
-            let (x, y) = (cell(u, columns, ready.width), cell(v, rows, ready.height));
-            let from = (y * columns + x) * dim;
-            sum.iter_mut().zip(&features.data[from..]).for_each(|(s, f)| *s += f);
+            let (x, y) = (cell_index(u, columns, ready.width), cell_index(v, rows, ready.height));
+            let start = (y * columns + x) * dim;
+            sum.iter_mut().zip(&features.data[start..]).for_each(|(s, f)| *s += f);
         }
         Ok(all)
     }
@@ -303,13 +298,18 @@ impl RegionEncoder for Clip {
         Ok(all)
     }
 
-    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+    fn embed_other_things(&mut self, form: &str) -> Result<Vec<f32>> {
         let texts = things::of_form(form);
         let graph = self.model.graph(Part::TextTower)?;
         let key = OutputKey::new("other-things").model(graph)?.text(&texts.join("\n"));
         let compute = graph.compute.clone();
         compute.remember(key, || self.embed_texts(&texts.iter().map(String::as_str).collect::<Vec<_>>()))
     }
+}
+
+/// Index of the cell of a coordinate, with `cells` over `pixels`.
+fn cell_index(u: f64, cells: usize, pixels: usize) -> usize {
+    ((u * cells as f64 / pixels as f64) as usize).min(cells - 1)
 }
 
 fn towers_differ(visual: &GraphFile, text: &GraphFile, why: &str) -> Error {
@@ -342,18 +342,21 @@ fn tokenizer(model: &Installed) -> Result<Tokenizer> {
     Ok(tokenizer)
 }
 
-/// What CLIP's own tokenizer does before it splits words: typographic quotes straightened (as ftfy
-/// does) and HTML entities resolved twice. Case and white space are the tokenizer file's affair.
+/// Cleans a text as CLIP's tokenizer does before it splits words: straightens typographic quotes
+/// (as ftfy) and resolves HTML entities twice. The tokenizer file handles case and white space.
 fn cleaned(text: &str) -> String {
     let entities =
         [("&lt;", "<"), ("&gt;", ">"), ("&quot;", "\""), ("&#39;", "'"), ("&nbsp;", " "), ("&amp;", "&")];
-    let quotes = |c: char| match c {
+    let resolve = |text: String| entities.iter().fold(text, |t, (from, to)| t.replace(from, to));
+    resolve(resolve(text.chars().map(straight_quote).collect())).trim().to_string()
+}
+
+fn straight_quote(c: char) -> char {
+    match c {
         '‘' | '’' | '‚' | '‛' => '\'',
         '“' | '”' | '„' | '‟' => '"',
         c => c,
-    };
-    let once = |text: String| entities.iter().fold(text, |t, (from, to)| t.replace(from, to));
-    once(once(text.chars().map(quotes).collect())).trim().to_string()
+    }
 }
 
 #[cfg(test)]
@@ -364,12 +367,12 @@ mod tests {
     use splatvk_test_support::toys::clip_in;
 
     #[test]
-    fn features_that_are_kept_are_those_of_the_photos_masks() {
+    fn cached_features_depend_on_masks() {
         let dir = tempfile::tempdir().unwrap();
         clip_in(dir.path(), [0, 1, 2]);
         let registry = Registry::with(Some(dir.path()), Compute::by(Some("cpu"))).unwrap();
         let mut clip = Clip::load(registry.installed(Task::Features, "clip").unwrap()).unwrap();
-        // Red above, blue below, and a mask of each half; then the two masks change places.
+        // Red above, blue below, and a mask of each half; then with the masks exchanged.
         let data = (0..640).map(|p| if p < 320 { [1.0, 0.0, 0.0] } else { [0.0, 0.0, 1.0] }).collect();
         let image = RgbImage { width: 32, height: 20, data };
         let mut first_is_red = |labels: [i32; 2]| {
@@ -382,7 +385,7 @@ mod tests {
     }
 
     #[test]
-    fn quotes_are_straightened_and_entities_resolved_as_clip_does() {
+    fn cleaned_text_matches_clip() {
         let given = [" grandmother’s “vase” ", "&amp;amp; more", "a &lt;b&gt; c&#39;s"];
         assert_eq!(given.map(cleaned), ["grandmother's \"vase\"", "& more", "a <b> c's"]);
     }

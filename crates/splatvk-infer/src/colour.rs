@@ -1,12 +1,10 @@
-//! The eleven basic colour terms of English (Berlin & Kay 1969): which of them a patch shows, which
-//! of them a text names.
+//! The eleven basic colour terms of English (Berlin & Kay 1969) in pixels and texts.
 use std::sync::OnceLock;
 
-/// Terms that languages with eleven colour words share.
+/// Number of terms.
 pub const COUNT: usize = 11;
 
-/// Term, other spellings and words taken for it, and an sRGB colour near the middle of what people
-/// call by it.
+/// Term with other spellings and synonyms, and a typical sRGB colour.
 const TERMS: [(&[&str], [u8; 3]); COUNT] = [
     (&["black"], [0, 0, 0]),
     (&["white"], [255, 255, 255]),
@@ -21,7 +19,7 @@ const TERMS: [(&[&str], [u8; 3]); COUNT] = [
     (&["brown"], [110, 65, 30]),
 ];
 
-/// Lab distance over which one term fades into the next: neighbouring middles lie 40 to 80 apart.
+/// Standard deviation of a term in Lab: neighbouring colours of [`TERMS`] are 40 to 80 apart.
 const SPREAD: f32 = 20.0;
 
 /// CIE L*a*b* (D65) of an sRGB colour in [0, 1].
@@ -35,7 +33,7 @@ pub fn lab(rgb: [f32; 3]) -> [f32; 3] {
     [116.0 * f(y) - 16.0, 500.0 * (f(x) - f(y)), 200.0 * (f(y) - f(z))]
 }
 
-/// How likely each term is said of a colour; sums to 1.
+/// Probability of each term for a colour; sums to 1.
 pub fn terms_of(rgb: [f32; 3]) -> [f32; COUNT] {
     static MIDDLES: OnceLock<[[f32; 3]; COUNT]> = OnceLock::new();
     let middles = MIDDLES.get_or_init(|| TERMS.map(|(_, rgb)| lab(rgb.map(|v| f32::from(v) / 255.0))));
@@ -48,8 +46,8 @@ pub fn terms_of(rgb: [f32; 3]) -> [f32; COUNT] {
     weights.map(|w| w / total)
 }
 
-/// [`terms_of`] the middle of the colour's cell in a cube of 32³ cells: at most 4/255 off, and
-/// quick enough for every pixel.
+/// [`terms_of`] the centre of the colour's cell in a table of 32³ cells: at most 4/255 off, and
+/// fast enough for every pixel.
 pub fn terms_near(rgb: [f32; 3]) -> &'static [f32; COUNT] {
     const CELLS: usize = 32;
     static TABLE: OnceLock<Vec<[f32; COUNT]>> = OnceLock::new();
@@ -64,9 +62,9 @@ pub fn terms_near(rgb: [f32; 3]) -> &'static [f32; COUNT] {
 pub fn terms_in(text: &str) -> Option<[f32; COUNT]> {
     let text = text.to_lowercase();
     let words: Vec<&str> = text.split(|c: char| !c.is_alphanumeric()).collect();
-    let said = TERMS.each_ref().map(|(names, _)| names.iter().any(|n| words.contains(n)));
-    let count = said.iter().filter(|s| **s).count() as f32;
-    (count > 0.0).then(|| said.map(|s| if s { 1.0 / count } else { 0.0 }))
+    let named = TERMS.each_ref().map(|(names, _)| names.iter().any(|n| words.contains(n)));
+    let count = named.iter().filter(|s| **s).count() as f32;
+    (count > 0.0).then(|| named.map(|s| if s { 1.0 / count } else { 0.0 }))
 }
 
 /// The eleven terms.
@@ -74,37 +72,37 @@ pub fn names() -> impl Iterator<Item = &'static str> {
     TERMS.iter().map(|(names, _)| names[0])
 }
 
-/// The terms that do not mean the same as a colour word.
+/// The terms without `word` among their spellings.
 pub fn names_besides(word: &str) -> impl Iterator<Item = &'static str> {
     TERMS.iter().filter(move |(names, _)| !names.contains(&word)).map(|(names, _)| names[0])
 }
 
-/// The colour words of a text, as it says them.
+/// The colour words of a text in its spelling, lower case.
 pub fn words_in(text: &str) -> Vec<String> {
     let lower = text.to_lowercase();
     let words = lower.split(|c: char| !c.is_alphanumeric());
     words.filter(|w| TERMS.iter().any(|(names, _)| names.contains(w))).map(str::to_owned).collect()
 }
 
-/// A text without its colour words; all of it where nothing else is left.
+/// A text without its colour words; the whole text if it has no other words.
 pub fn without(text: &str) -> String {
     let is_colour = |w: &&str| TERMS.iter().any(|(names, _)| names.contains(&w.to_lowercase().as_str()));
     let rest: Vec<&str> = text.split_whitespace().filter(|w| !is_colour(w)).collect();
     if rest.is_empty() { text.to_owned() } else { rest.join(" ") }
 }
 
-/// The term that a direction of [`direction`]'s space is nearest to, and the cosine to it.
+/// The term nearest to a vector of [`direction`]'s space, and their cosine.
 pub fn nearest_term(towards: &[f32]) -> (&'static str, f32) {
     let cosine = |i: usize| {
-        let one = std::array::from_fn(|k| if k == i { 1.0 } else { 0.0 });
-        direction(&one).iter().zip(towards).map(|(a, b)| a * b).sum::<f32>()
+        let axis = std::array::from_fn(|k| if k == i { 1.0 } else { 0.0 });
+        direction(&axis).iter().zip(towards).map(|(a, b)| a * b).sum::<f32>()
     };
     let best = (0..COUNT).map(|i| (i, cosine(i))).max_by(|a, b| a.1.total_cmp(&b.1));
     best.map_or(("", 0.0), |(i, cosine)| (TERMS[i].0[0], cosine))
 }
 
 /// Distribution over terms → direction: square roots (so that a dot product is a Bhattacharyya
-/// coefficient) less what all terms share, unit length. An even distribution gives zero.
+/// coefficient) less their mean, scaled to unit length. An even distribution gives zero.
 pub fn direction(distribution: &[f32; COUNT]) -> [f32; COUNT] {
     let roots = distribution.map(f32::sqrt);
     let mean = roots.iter().sum::<f32>() / COUNT as f32;
@@ -137,7 +135,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_get_their_names_and_texts_give_theirs() {
+    fn colour_terms_of_pixels_and_texts() {
         let name = |rgb: [u8; 3]| {
             let terms = terms_of(rgb.map(|v| f32::from(v) / 255.0));
             let best = (0..COUNT).max_by(|a, b| terms[*a].total_cmp(&terms[*b])).unwrap();

@@ -1,4 +1,4 @@
-//! How networks are computed.
+//! Execution settings of networks.
 use super::cache::{self, OutputKey};
 use super::provider::{Provider, find};
 use crate::progress::Progress;
@@ -7,8 +7,8 @@ use crate::{Error, Result};
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
-/// How networks are computed: by which provider, and whether their answers are kept. Clones share
-/// it; several in one process may differ, except that they share the one loaded library.
+/// Execution settings of networks: the provider, and whether outputs are cached. Clones share them.
+/// Several in one process may differ, but share the loaded library.
 #[derive(Clone)]
 pub struct Compute(Arc<Shared>);
 
@@ -33,8 +33,7 @@ impl Default for Compute {
 }
 
 impl Compute {
-    /// By one of [`super::provider::NAMES`]; by default what `SPLATVK_PROVIDER` says, and without
-    /// it `auto`.
+    /// Selects one of [`super::provider::NAMES`]; by default `SPLATVK_PROVIDER`, else `auto`.
     pub fn by(asked: Option<&str>) -> Compute {
         let variable = || std::env::var("SPLATVK_PROVIDER").ok().filter(|v| !v.is_empty());
         let asked = asked.map(str::to_owned).or_else(variable).unwrap_or_else(|| "auto".to_owned());
@@ -46,36 +45,36 @@ impl Compute {
         Compute(Arc::new(Shared { asked, cached, chosen, notes, turn }))
     }
 
-    /// By the same provider, and everything is computed: what is measured must be.
+    /// The same provider without the cache, for measurements.
     pub fn uncached(&self) -> Compute {
         Compute::new(self.0.asked.clone(), false)
     }
 
-    /// `compute`, or what it gave the last time with the same key.
+    /// Returns the cached result of `key`, else computes and stores it.
     pub fn remember(&self, key: OutputKey, compute: impl FnOnce() -> Result<Vec<f32>>) -> Result<Vec<f32>> {
         if self.0.cached { cache::remember(key, compute) } else { compute() }
     }
 
-    /// Held while a large network is loaded: stages that run beside each other take turns, so that
-    /// a run needs the memory of one network and every network has all cores.
+    /// Lock to hold while a large network is loaded: concurrent stages take turns, so that a run
+    /// needs the memory of one network and every network has all cores.
     pub fn turn(&self) -> MutexGuard<'_, ()> {
         lock(&self.0.turn)
     }
 
-    /// The provider of new sessions, `None` for the CPU: found by computing a graph of one node on
-    /// it. Asked for by name, one that does not answer is an error.
+    /// The provider of new sessions, tested by a graph of one node; `None` for the CPU. A provider
+    /// that was requested by name and fails is an error.
     pub(super) fn selected(&self) -> Result<Option<&'static Provider>> {
         let found = || find(&self.0.asked, &mut |text| self.note(text));
         self.0.chosen.get_or_init(found).clone().map_err(Error::missing)
     }
 
-    /// The name of what computes the networks.
+    /// Name of the provider.
     pub fn name(&self) -> Result<&'static str> {
         Ok(self.selected()?.map_or("cpu", |p| p.name))
     }
 
-    /// A network that the chosen provider refuses is computed by the CPU if nobody asked for the
-    /// provider by name.
+    /// Whether the CPU may compute a network that the provider refuses: with `auto`, not with a
+    /// provider requested by name.
     pub(super) fn replaceable(&self) -> bool {
         self.0.asked == "auto"
     }
@@ -84,13 +83,13 @@ impl Compute {
         lock(&self.0.notes).push(text);
     }
 
-    /// Finds the provider, and returns what did not work since the last call, a sentence each.
+    /// Finds the provider and returns the problems since the last call, one sentence each.
     pub fn notes(&self) -> Result<Vec<String>> {
         self.selected()?;
         Ok(std::mem::take(&mut *lock(&self.0.notes)))
     }
 
-    /// Warns of [`Compute::notes`].
+    /// Reports [`Compute::notes`] as warnings.
     pub fn report(&self, progress: &dyn Progress) -> Result<()> {
         self.notes()?.iter().for_each(|n| progress.warn(n));
         Ok(())
@@ -102,11 +101,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn two_in_one_process_differ() {
+    fn compute_settings_are_independent() {
         let (cpu, absent) = (Compute::by(Some("cpu")), Compute::by(Some("gpu")));
         assert_eq!(cpu.name().unwrap(), "cpu");
         assert!(absent.name().unwrap_err().to_string().contains("auto, cpu, cuda"));
-        // Answers are kept by one and not by the other.
+        // The uncached settings ignore the cached value.
         let key = || OutputKey::new("test").text("two").values(&[std::process::id()]);
         let value = |compute: &Compute, v: f32| compute.remember(key(), || Ok(vec![v])).unwrap();
         assert_eq!(value(&cpu, 1.0), [1.0]);

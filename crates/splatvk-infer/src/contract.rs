@@ -1,12 +1,12 @@
-//! What splatvk requires of a graph: for every part of a model the roles of its inputs and outputs
-//! and the shapes in which the rest of the program sees them. Which name, layout and range a file
-//! uses for a role is data: see [`super::adapter`].
+//! Required interface of a graph: for every part of a model the roles of its inputs and outputs and
+//! their shapes in the program. Names, layouts and ranges of a file are data: see
+//! [`super::adapter`].
 //!
 //! A shape is a row of axis names: "B H W 3" has a free batch, height and width, and three
 //! channels. An axis that occurs twice in one contract has one length.
 use serde::{Deserialize, Serialize};
 
-/// What a graph does.
+/// Part of a model that a graph computes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Deserialize, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
@@ -17,7 +17,7 @@ pub enum Part {
     TextTower,
     /// Image → embedding per pixel (LSeg).
     DenseFeatures,
-    /// Image → what the mask decoder needs (SAM).
+    /// Image → inputs of the mask decoder (SAM).
     MaskEncoder,
     /// Prompts → masks (SAM).
     MaskDecoder,
@@ -29,7 +29,7 @@ pub enum Part {
     PairDecoder,
     /// All images → depth and cameras (VGGT and others).
     MultiView,
-    /// Two images → where each pixel of one is in the other (RoMa).
+    /// Two images → dense warp (RoMa).
     Warp,
     /// Image → depth of unknown scale and shift (Depth Anything, MiDaS).
     Depth,
@@ -41,7 +41,7 @@ impl Part {
         self.contract().name
     }
 
-    /// What the part must take and give.
+    /// The required inputs and outputs.
     pub fn contract(self) -> &'static Contract {
         match self {
             Part::ImageTower => &IMAGE_TOWER,
@@ -62,15 +62,15 @@ impl Part {
 /// One input or output.
 #[derive(Debug)]
 pub struct Slot {
-    /// What it is for.
+    /// Its role.
     pub role: &'static str,
-    /// Its axes as the program sees them.
+    /// Its axes in the program.
     pub shape: &'static str,
     /// Other layouts that graphs use; the program reorders them.
     pub layouts: &'static [&'static str],
-    /// Graphs without it are fine.
+    /// Whether a graph may lack it.
     pub optional: bool,
-    /// Whole numbers are natural for it.
+    /// Whether it may be of integers.
     pub integer: bool,
 }
 
@@ -79,9 +79,9 @@ pub struct Slot {
 pub struct Contract {
     /// The part's name.
     pub name: &'static str,
-    /// What it must take.
+    /// Its inputs.
     pub inputs: &'static [Slot],
-    /// What it must give.
+    /// Its outputs.
     pub outputs: &'static [Slot],
 }
 
@@ -144,7 +144,7 @@ static MASK_DECODER: Contract = Contract {
     ],
     outputs: &[slot("masks", "P M x y", &["b P M x y"]), slot("scores", "P M", &["b P M"])],
 };
-/// Outputs of a pair, and what may follow them.
+/// Outputs of a pair network, with optional descriptors.
 macro_rules! pair_outputs {
     () => {
         &[
@@ -206,8 +206,7 @@ static WARP: Contract = Contract {
     ],
 };
 
-// Which of the two it gives, the adapter says: names do not (Depth Anything calls both
-// "predicted_depth").
+// The adapter states which of the two a graph gives: Depth Anything calls both "predicted_depth".
 static DEPTH: Contract = Contract {
     name: "depth",
     inputs: &[slot("image", "B 3 H W", &["B H W 3"])],
@@ -237,8 +236,8 @@ pub fn axes(shape: &str) -> impl Iterator<Item = &str> {
     shape.split_whitespace()
 }
 
-/// Whether a tensor of `dims` (None = any) can have `shape`, given axis lengths found so far, which
-/// it adds to.
+/// Whether a tensor of `dims` (`None` = any) can have `shape`, given the axis lengths in `known`;
+/// if so, adds the new lengths.
 pub fn unify<'s>(shape: &'s str, dims: &[Option<usize>], known: &mut Vec<(&'s str, usize)>) -> bool {
     let start = known.len();
     let fits = axes(shape).count() == dims.len()
@@ -261,8 +260,8 @@ pub fn unify<'s>(shape: &'s str, dims: &[Option<usize>], known: &mut Vec<(&'s st
     fits
 }
 
-/// Reorders axes: those that `to` lacks must have length 1 and go, those that `from` lacks come
-/// with length 1. `None` when the values do not have the shape `from`.
+/// Reorders axes. Axes that `to` lacks must have length 1 and are removed; those that `from` lacks
+/// are added with length 1. `None` when the values do not have the shape `from`.
 pub fn reorder<T: Copy>(
     shape: Vec<usize>,
     data: Vec<T>,
@@ -306,7 +305,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn layouts_are_reordered_and_single_axes_come_and_go() {
+    fn relayout_reorders_and_changes_unit_axes() {
         let t = Tensor { shape: vec![1, 2, 2, 3], data: (0..12).map(|v| v as f32).collect() };
         let last = relayout(t.clone(), "B C H W", "B H W C").unwrap();
         assert_eq!(last.shape, [1, 2, 3, 2]);
@@ -318,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn shapes_agree_where_axes_share_a_name() {
+    fn unify_binds_axes_by_name() {
         let mut known = Vec::new();
         assert!(unify("B H W 3", &[Some(1), Some(4), None, Some(3)], &mut known));
         assert!(unify("B H W", &[None, Some(4), Some(5)], &mut known));

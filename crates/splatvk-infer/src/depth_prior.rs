@@ -1,5 +1,5 @@
-//! Depth priors: what a network says of the depth of each photo, or a folder of files holds. Scale
-//! and shift stay open; `pose::stereo` of splatvk finds them.
+//! Depth priors of photos, from a network or a folder of files. Scale and shift are unknown;
+//! `pose::stereo` of splatvk estimates them.
 use std::path::Path;
 
 use glam::DVec2;
@@ -14,8 +14,7 @@ use crate::progress::Progress;
 use crate::scene::{DepthPrior, Image, PairPointmaps, Pointmap, PriorKind};
 use crate::{Error, Result};
 
-/// One prior per photo, at its working size, from a network of one photo's depth or a geometry
-/// network.
+/// One prior per photo, at its working size, from a monocular depth network or a geometry network.
 pub fn of_network(
     model: &Installed,
     photos: &[Photo],
@@ -47,20 +46,20 @@ pub fn of_network(
             _ => return Err(Error::work(format!("{}: gave no depth map", file.path.display()))),
         };
         let map = with_horizon(map, kind);
-        // The output may be smaller than the input, and covers the same part of the photo.
+        // The output covers the same part of the photo as the input and may be smaller.
         let shrunk = [map.width as f64 / ready.width as f64, map.height as f64 / ready.height as f64];
         let place = |p: DVec2| {
             let [u, v] = ready.from_photo.apply(p.to_array());
             DVec2::new(u * shrunk[0], v * shrunk[1])
         };
-        priors.push(Some(DepthPrior { values: sampled(&map, photo, place), kind }));
+        priors.push(Some(DepthPrior { values: resampled(&map, photo, place), kind }));
         progress.step(priors.len() as u64, &photo.stem);
     }
     progress.end();
     Ok(priors)
 }
 
-/// The output that the graph has, and what it is.
+/// Role and kind of the graph's output.
 fn output(file: &GraphFile) -> (&'static str, PriorKind) {
     match file.has("depth") {
         true => ("depth", PriorKind::Depth),
@@ -68,8 +67,8 @@ fn output(file: &GraphFile) -> (&'static str, PriorKind) {
     }
 }
 
-/// Smallest inverse depth, share of the largest, that counts as known: networks give 0 or a little
-/// less for the sky.
+/// Lower limit of inverse depth, as a share of the largest: networks give 0 or slightly less for
+/// the sky.
 const HORIZON: f32 = 1e-4;
 
 fn with_horizon(mut map: Image<f32>, kind: PriorKind) -> Image<f32> {
@@ -80,38 +79,38 @@ fn with_horizon(mut map: Image<f32>, kind: PriorKind) -> Image<f32> {
     map
 }
 
-/// Depth of each photo in the pair that its network is surest of.
+/// Depth of each photo from the pair with the largest confidence.
 fn of_pointmaps(
     model: &Installed,
     photos: &[Photo],
     progress: &dyn Progress,
 ) -> Result<Vec<Option<DepthPrior>>> {
     let maps = super::pairs::pointmaps(model, photos, progress)?;
-    let of = |view: usize| {
-        let own = |p: &'_ PairPointmaps| -> Option<Pointmap> {
-            if p.first == view {
-                return Some(p.x11.clone());
-            }
-            (p.second == view).then(|| p.x22.clone())
-        };
-        let sure = |m: &Pointmap| m.confidence.iter().map(|c| f64::from(*c)).sum::<f64>();
-        maps.pairs.iter().filter_map(own).max_by(|a, b| sure(a).total_cmp(&sure(b)))
-    };
     let prior = |(view, photo): (usize, &Photo)| {
-        let (seen, map) = (&maps.views[view], of(view)?);
+        let (seen, map) = (&maps.views[view], most_confident(&maps.pairs, view)?);
         let depth = map.points.iter().map(|p| p[2]).collect();
         let depth = Image { width: seen.width, height: seen.height, data: depth };
         let place = |p: DVec2| DVec2::from_array(seen.from_working.apply(p.to_array()));
-        Some(DepthPrior { values: sampled(&depth, photo, place), kind: PriorKind::Depth })
+        Some(DepthPrior { values: resampled(&depth, photo, place), kind: PriorKind::Depth })
     };
     Ok(photos.iter().enumerate().map(prior).collect())
 }
 
-/// Names of a photo's file in a folder of priors.
+/// Pointmap of a view in its own frame, from the pair with the largest confidence.
+fn most_confident(pairs: &[PairPointmaps], view: usize) -> Option<&Pointmap> {
+    let first = |p: &PairPointmaps| p.first == view;
+    let of_view = pairs.iter().filter(|p| first(p) || p.second == view);
+    let confidence = |m: &Pointmap| m.confidence.iter().map(|c| f64::from(*c)).sum::<f64>();
+    of_view
+        .map(|p| if first(p) { &p.x11 } else { &p.x22 })
+        .max_by(|a, b| confidence(a).total_cmp(&confidence(b)))
+}
+
+/// File names of a photo's priors, behind its stem.
 const FILES: [(&str, PriorKind); 2] =
     [("depth.npy", PriorKind::Depth), ("inverse_depth.npy", PriorKind::InverseDepth)];
-/// Relative difference of the aspects of a map and its photo that rounding explains: a pixel of a
-/// map 64 pixels high.
+/// Largest relative difference of the aspect ratios of a map and its photo: a pixel of a map 64
+/// pixels high.
 const ASPECT: f64 = 0.016;
 
 /// The priors of a folder: per photo `<stem>_depth.npy` or `<stem>_inverse_depth.npy`, H × W floats
@@ -168,32 +167,35 @@ fn of_file(folder: &Path, photo: &Photo) -> Result<Option<DepthPrior>> {
         let [u, v] = back.apply(photo.source(p).to_array());
         DVec2::new(u * width as f64 / w, v * height as f64 / h)
     };
-    Ok(Some(DepthPrior { values: sampled(&map, photo, place), kind: *kind }))
+    Ok(Some(DepthPrior { values: resampled(&map, photo, place), kind: *kind }))
 }
 
-/// A map at the photo's working pixels, which lie at `place` in it: bilinear between known values,
-/// the nearest beside unknown ones; 0 outside and where unknown.
-fn sampled(map: &Image<f32>, photo: &Photo, place: impl Fn(DVec2) -> DVec2) -> Image<f32> {
+/// Resamples a map to the photo's working pixels; `place` gives their positions in the map.
+/// Bilinear between known values, nearest beside unknown ones; 0 outside and where unknown.
+fn resampled(map: &Image<f32>, photo: &Photo, place: impl Fn(DVec2) -> DVec2) -> Image<f32> {
     let (width, height) = (photo.image.width, photo.image.height);
-    let known = |v: f32| if v.is_finite() && v > 0.0 { v } else { 0.0 };
-    let value = |p: DVec2| {
-        let (w, h) = (map.width as f64, map.height as f64);
-        if p.x < 0.0 || p.y < 0.0 || p.x >= w || p.y >= h {
-            return 0.0;
-        }
-        let (x, y) = ((p.x - 0.5).clamp(0.0, w - 1.0), (p.y - 0.5).clamp(0.0, h - 1.0));
-        let (x0, y0) = (x as usize, y as usize);
-        let (x1, y1) = ((x0 + 1).min(map.width - 1), (y0 + 1).min(map.height - 1));
-        let four = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| known(map.at(x, y)));
-        if four.contains(&0.0) {
-            return known(map.at(p.x as usize, p.y as usize));
-        }
-        let (fx, fy) = (x.fract() as f32, y.fract() as f32);
-        let mix = |a: f32, b: f32, t: f32| a + t * (b - a);
-        mix(mix(four[0], four[1], fx), mix(four[2], four[3], fx), fy)
-    };
     let pixel = |k: usize| DVec2::new((k % width) as f64 + 0.5, (k / width) as f64 + 0.5);
-    Image { width, height, data: (0..width * height).map(|k| value(place(pixel(k)))).collect() }
+    let values = (0..width * height).map(|k| interpolate(map, place(pixel(k))));
+    Image { width, height, data: values.collect() }
+}
+
+/// Value of a map at a position; 0 = unknown.
+fn interpolate(map: &Image<f32>, p: DVec2) -> f32 {
+    let (w, h) = (map.width as f64, map.height as f64);
+    if p.x < 0.0 || p.y < 0.0 || p.x >= w || p.y >= h {
+        return 0.0;
+    }
+    let known = |v: f32| if v.is_finite() && v > 0.0 { v } else { 0.0 };
+    let (x, y) = ((p.x - 0.5).clamp(0.0, w - 1.0), (p.y - 0.5).clamp(0.0, h - 1.0));
+    let (x0, y0) = (x as usize, y as usize);
+    let (x1, y1) = ((x0 + 1).min(map.width - 1), (y0 + 1).min(map.height - 1));
+    let four = [(x0, y0), (x1, y0), (x0, y1), (x1, y1)].map(|(x, y)| known(map.at(x, y)));
+    if four.contains(&0.0) {
+        return known(map.at(p.x as usize, p.y as usize));
+    }
+    let (fx, fy) = (x.fract() as f32, y.fract() as f32);
+    let mix = |a: f32, b: f32, t: f32| a + t * (b - a);
+    mix(mix(four[0], four[1], fx), mix(four[2], four[3], fx), fy)
 }
 
 #[cfg(test)]
@@ -215,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn networks_of_one_photo_give_inverse_depth_unless_their_adapter_says_depth() {
+    fn network_prior_kind_follows_adapter() {
         let dir = tempfile::tempdir().unwrap();
         let graph = Onnx::new()
             .input("pixel_values", FLOAT, "batch 3 height width")
@@ -239,18 +241,21 @@ mod tests {
         );
         let (left, right) = (relative.values.at(8, 14), relative.values.at(48, 14));
         // The mean over the channels of (value − mean) / deviation.
-        let of = |v: f32| {
+        let mean_input = |v: f32| {
             [(0.485, 0.229), (0.456, 0.224), (0.406, 0.225)].map(|(m, s)| (v - m) / s).iter().sum::<f32>()
                 / 3.0
         };
-        assert!((left - of(0.6)).abs() < 1e-3 && (right - of(0.9)).abs() < 1e-3, "{left} {right}");
+        assert!(
+            (left - mean_input(0.6)).abs() < 1e-3 && (right - mean_input(0.9)).abs() < 1e-3,
+            "{left} {right}"
+        );
         std::fs::write(dir.path().join("depth_anything_v2_small/adapter.toml"), "family = \"metric-depth\"")
             .unwrap();
         assert_eq!(prior().kind, PriorKind::Depth);
     }
 
     #[test]
-    fn files_of_any_size_are_read_and_wrong_ones_named() {
+    fn folder_priors_refuse_wrong_files() {
         let dir = tempfile::tempdir().unwrap();
         let photos = [picture("a"), picture("b")];
         let refused = |says: &str| {

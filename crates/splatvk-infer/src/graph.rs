@@ -14,22 +14,22 @@ use crate::{Error, Result};
 /// A file with its checksum.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HashedFile {
-    /// Where it lies.
+    /// Its path.
     pub path: PathBuf,
-    /// In hexadecimal digits.
+    /// Its sha256 in hexadecimal digits.
     pub sha256: String,
 }
 
 /// A model file that was recognised, not yet loaded.
 #[derive(Clone, Debug)]
 pub struct GraphFile {
-    /// Where it is.
+    /// Its path.
     pub path: PathBuf,
-    /// What it is.
+    /// Its part, and the roles of its tensors.
     pub binding: Binding,
-    /// The weights that the adapter names.
+    /// Checkpoint that the adapter names.
     pub checkpoint: Option<String>,
-    /// The weights were never trained.
+    /// Whether the weights are untrained.
     pub untrained: bool,
     /// Number of weights.
     pub parameters: u64,
@@ -39,12 +39,12 @@ pub struct GraphFile {
     pub external: Vec<PathBuf>,
     /// The sha256 that the adapter pins of these files.
     pub pinned: Vec<HashedFile>,
-    /// How it is computed.
+    /// Execution settings.
     pub compute: Compute,
 }
 
 impl GraphFile {
-    /// Reads the file's header and finds its part; the error names the file and the mend.
+    /// Reads the file's header and finds its part; the error names the file and the remedy.
     pub fn recognise(path: &Path) -> Result<GraphFile> {
         let header: Header = onnx::read(path)?;
         let adapter = Adapter::of_file(path)?;
@@ -83,15 +83,15 @@ impl GraphFile {
         size(&self.path) + self.external.iter().map(size).sum::<u64>()
     }
 
-    /// The length of an axis of a role's tensor, where the file fixes it.
+    /// The length of an axis of a role's tensor, if the file fixes it.
     pub fn fixed(&self, role: &str, axis: &str) -> Option<usize> {
         let bound = self.binding.ports.get(role)?;
         let place = super::contract::axes(bound.layout?).position(|a| a == axis)?;
         bound.dims.as_ref()?.get(place)?.length()
     }
 
-    /// Of the layouts that an output's lengths allow, takes the first in which `axis` has `length`,
-    /// if there is one.
+    /// Selects the first layout that the lengths of an output allow and in which `axis` has
+    /// `length`, if there is one.
     pub(super) fn fix_axis(&mut self, role: &str, axis: &str, length: usize) {
         let Some(slot) = self.binding.part.contract().slot(role) else { return };
         let Some(bound) = self.binding.ports.get_mut(role) else { return };
@@ -109,7 +109,7 @@ impl GraphFile {
         self.binding.ports.contains_key(role)
     }
 
-    /// Loads it, if its files are what the adapter pins.
+    /// Checks the pinned sha256 of the files and loads the graph.
     pub fn load(&self) -> Result<Graph> {
         for HashedFile { path: file, sha256: wanted } in &self.pinned {
             let found = fingerprint(file).map_err(Error::io(file))?;
@@ -137,11 +137,11 @@ impl GraphFile {
 /// A loaded graph. Dropping it frees its memory.
 pub struct Graph {
     session: Session,
-    /// What it was loaded from.
+    /// Its file.
     pub file: GraphFile,
 }
 
-/// What a graph returned, by role.
+/// Outputs of a graph, by role.
 #[derive(Debug, Default)]
 pub struct Outputs {
     values: BTreeMap<&'static str, Tensor>,
@@ -173,7 +173,7 @@ impl Graph {
                 continue;
             };
             let lengths: Vec<Option<usize>> = input.shape().iter().map(|n| Some(*n)).collect();
-            // What goes in fixes the axes that outputs share with it.
+            // Inputs fix the axes that outputs share with them.
             unify(slot.shape, &lengths, &mut known);
             let input = match bound.layout {
                 Some(layout) if layout != slot.shape => input.relaid(slot.shape, layout),
@@ -205,7 +205,7 @@ impl Graph {
         Ok(Outputs { values, file: name })
     }
 
-    /// The tensor in the contract's layout, whichever of the known ones it came in.
+    /// Converts a tensor from any known layout to the contract's.
     fn canonical<'s>(
         &self,
         slot: &'static Slot,
@@ -236,7 +236,7 @@ impl Graph {
 }
 
 impl OutputKey {
-    /// Depends on the content of a model's files and on their adapters.
+    /// Adds the content of a model's files and their adapters.
     pub fn model(mut self, graph: &GraphFile) -> Result<OutputKey> {
         for file in std::iter::once(&graph.path).chain(&graph.external) {
             self = self.text(&fingerprint(file).map_err(crate::Error::io(file))?);
@@ -257,7 +257,7 @@ mod tests {
     use splatvk_test_support::onnx::{FLOAT, Onnx};
 
     #[test]
-    fn what_is_kept_depends_on_the_adapter() {
+    fn output_key_depends_on_adapter() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("graph.onnx");
         Onnx::new()
@@ -267,7 +267,7 @@ mod tests {
         let key = || OutputKey::new("test").model(&GraphFile::recognise(&path).unwrap()).unwrap().short();
         let plain = key();
         assert_eq!(key(), plain);
-        // The same file, given its photos in another range.
+        // The same file with another input range.
         let adapter = "family = \"clip\"\n[[graph]]\npart = \"image-tower\"\n\
                        image = { mean = [0.5, 0.5, 0.5], std = [0.5, 0.5, 0.5], size = 16 }";
         std::fs::write(path.with_extension("toml"), adapter).unwrap();

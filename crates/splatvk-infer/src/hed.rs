@@ -5,9 +5,9 @@ use crate::scene::resize::Kernel;
 use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 
-/// Longer side of the largest image that the network sees, pixels. Each of its first maps takes 256
-/// bytes per pixel: 490 MB at this size, 3 GB for a photo of 12 megapixels. Outlines of objects are
-/// as clear in the smaller image.
+/// Longer side of the network's largest input, pixels. Each of its first maps takes 256 bytes per
+/// pixel: 490 MB at this size, 3 GB for a photo of 12 megapixels. Outlines of objects are as clear
+/// in the smaller image.
 const LARGEST_SIDE: usize = 1600;
 
 /// The loaded network.

@@ -1,5 +1,5 @@
-//! The networks that users brought: every `.onnx` file in the model folders, recognised and put
-//! together into models.
+//! Installed networks of users: the `.onnx` files in the model folders, recognised and grouped into
+//! models.
 //!
 //! A folder is a model (`sam_vit_b/encoder.onnx`, `sam_vit_b/decoder.onnx`); files that lie
 //! directly in a model folder belong together when their names do (`sam_vit_b_encoder.onnx`,
@@ -16,20 +16,20 @@ pub use super::graph::HashedFile;
 use super::registry::Registry;
 use crate::{Error, Result};
 
-/// A network that is there, whole.
+/// A complete installed model.
 #[derive(Clone, Debug)]
 pub struct Installed {
-    /// Name of its folder, or what its file names share.
+    /// Name of its folder, or the common part of its file names.
     pub name: String,
-    /// What `--init` and the others call it.
+    /// Its name in `--init` and similar options.
     pub family: String,
-    /// What it does.
+    /// Its tasks.
     pub tasks: Vec<Task>,
     /// Its graphs, one per part.
     pub graphs: BTreeMap<Part, GraphFile>,
     /// Where it lies.
     pub folder: PathBuf,
-    /// Graphs beside it that it does without, and why each cannot be used.
+    /// Reasons why further graphs in its folder cannot be used.
     pub unused: Vec<String>,
 }
 
@@ -42,17 +42,17 @@ impl Installed {
         })
     }
 
-    /// How it is computed.
+    /// Execution settings.
     pub fn compute(&self) -> Compute {
         self.graphs.values().next().map(|g| g.compute.clone()).unwrap_or_default()
     }
 
-    /// Whether none of it was trained.
+    /// Whether one of its graphs is untrained.
     pub fn untrained(&self) -> bool {
         self.graphs.values().any(|g| g.untrained)
     }
 
-    /// The files that it consists of.
+    /// Its files with their sha256.
     pub fn files(&self) -> Result<Vec<HashedFile>> {
         let files = self.graphs.values().flat_map(|g| std::iter::once(&g.path).chain(&g.external));
         let hash = |file: &PathBuf| {
@@ -61,7 +61,7 @@ impl Installed {
         files.map(hash).collect()
     }
 
-    /// Place in the catalogue's order of preference; networks that it does not know come last.
+    /// Rank in the catalogue's order of preference; networks outside of it come last.
     fn rank(&self) -> usize {
         let own = self.catalogue_entry().map(|k| &k.id);
         catalogue().iter().position(|k| Some(&k.id) == own).unwrap_or(usize::MAX)
@@ -79,14 +79,14 @@ impl Installed {
 pub struct BrokenFile {
     /// Where it lies.
     pub path: PathBuf,
-    /// One line that says why and what to do.
+    /// Reason and remedy, one line.
     pub reason: String,
 }
 
-/// What the model folders hold beside the built-in pack.
+/// Contents of the model folders beside the built-in pack.
 #[derive(Debug, Default)]
 pub struct Inventory {
-    /// Whole models.
+    /// Complete models.
     pub models: Vec<Installed>,
     /// Files that cannot be used.
     pub broken: Vec<BrokenFile>,
@@ -96,12 +96,12 @@ impl Inventory {
     /// The most preferred network for a task that has trained weights.
     pub fn best(&self, task: Task) -> Option<&Installed> {
         let fitting = self.models.iter().filter(|m| m.tasks.contains(&task) && !m.untrained());
-        // What a network is made for comes before what it can do besides.
+        // A network with this as its main task comes first.
         fitting.min_by_key(|m| (m.tasks.first() != Some(&task), m.rank()))
     }
 }
 
-/// Sets of parts that make a model, and what it then does.
+/// Sets of parts that form a model, and its tasks.
 const WHOLE: [(&[Part], &[Task]); 8] = [
     (&[Part::Pair], &[Task::Geometry, Task::Depth]),
     (&[Part::PairEncoder, Part::PairDecoder], &[Task::Geometry, Task::Depth]),
@@ -113,7 +113,7 @@ const WHOLE: [(&[Part], &[Task]); 8] = [
     (&[Part::DenseFeatures, Part::TextTower], &[Task::Features, Task::Text]),
 ];
 
-/// Looks at every `.onnx` file in the folders of `registry` and one folder below.
+/// Recognises every `.onnx` file in the folders of `registry` and one folder below.
 pub fn inventory(registry: &Registry) -> Inventory {
     let mut found = Inventory::default();
     for folder in registry.folders() {
@@ -124,7 +124,7 @@ pub fn inventory(registry: &Registry) -> Inventory {
         for sub in folders(folder) {
             let name = sub.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let mut files = onnx_files(&sub);
-            // Hugging Face keeps the graphs of a model in a folder of this name.
+            // Repositories of Hugging Face have the graphs of a model in a folder of this name.
             files.extend(onnx_files(&sub.join("onnx")));
             if !files.is_empty() {
                 groups.entry((sub, name)).or_default().extend(files);
@@ -142,8 +142,8 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
     let mut failed: Vec<BrokenFile> = Vec::new();
     for file in files {
         match GraphFile::recognise(file) {
-            // The first of several variants (quantised, half precision): the plain name sorts
-            // first.
+            // The first of several variants (quantised, half precision) counts: the plain name
+            // sorts first.
             Ok(graph) => {
                 let graph = GraphFile { compute: compute.clone(), ..graph };
                 graphs.entry(graph.binding.part).or_insert(graph);
@@ -171,11 +171,11 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
         found.broken.push(BrokenFile { path: folder, reason: text });
         return;
     };
-    let stray = |a: &&GraphFile, b: &&GraphFile| {
+    let differ = |a: &&GraphFile, b: &&GraphFile| {
         a.checkpoint != b.checkpoint && a.checkpoint.is_some() && b.checkpoint.is_some()
     };
     let used: Vec<&GraphFile> = parts.iter().filter_map(|p| graphs.get(p)).collect();
-    if let Some(pair) = used.windows(2).find(|w| stray(&w[0], &w[1])) {
+    if let Some(pair) = used.windows(2).find(|w| differ(&w[0], &w[1])) {
         let text = format!(
             "{} and {}: weights of different checkpoints ({} and {}); export both from one",
             pair[0].path.display(),
@@ -201,8 +201,8 @@ fn group(folder: PathBuf, name: String, files: &[PathBuf], compute: &Compute, fo
 }
 
 impl Registry {
-    /// The model that `--init`, `--masks` and so on call `name` (a family or a model's own name):
-    /// of several the one that the catalogue names first. The error says what to do.
+    /// The model with `name` (a family or a model's own name) in `--init`, `--masks` and so on: of
+    /// several the first in the catalogue. The error states the remedy.
     pub fn installed(&self, task: Task, name: &str) -> Result<Installed> {
         let inventory = inventory(self);
         let mut fitting: Vec<Installed> = inventory
@@ -214,11 +214,11 @@ impl Registry {
         if let Some(model) = fitting.into_iter().next() {
             return Ok(model);
         }
-        let about = |path: &Path| {
+        let concerns = |path: &Path| {
             let text = path.to_string_lossy();
             catalogue().iter().any(|k| k.family == name && text.contains(&k.id)) || text.contains(name)
         };
-        if let Some(broken) = inventory.broken.iter().find(|b| about(&b.path)) {
+        if let Some(broken) = inventory.broken.iter().find(|b| concerns(&b.path)) {
             return Err(Error::missing_model(name, broken.reason.clone()));
         }
         let place = self.folders().first().map(|f| f.display().to_string()).unwrap_or_default();
@@ -228,8 +228,8 @@ impl Registry {
     }
 }
 
-/// What to do about a model that is not there: fetch it, or the one of its family that needs no
-/// export, or bring its files.
+/// Remedy for a missing model: fetch it or the one of its family that needs no export, or copy its
+/// files.
 fn how_to_get(name: &str, task: Task, place: &str) -> String {
     let own = catalogue().iter().find(|k| k.id == name);
     let family = || catalogue().iter().filter(|k| k.family == name && k.does(task));
@@ -266,7 +266,7 @@ fn entries(folder: &Path) -> Vec<PathBuf> {
     list
 }
 
-/// A file's name without the words that name a part.
+/// File name without words for parts.
 fn shared_name(file: &Path) -> String {
     const PARTS: [&str; 14] = [
         "encoder", "decoder", "enc", "dec", "vision", "visual", "image", "text", "textual", "model", "fp16",
@@ -288,7 +288,7 @@ mod tests {
     use splatvk_test_support::toys::clip_in;
 
     #[test]
-    fn networks_that_were_never_trained_are_chosen_by_name_only() {
+    fn inventory_best_skips_untrained_networks() {
         let dir = tempfile::tempdir().unwrap();
         clip_in(dir.path(), [0, 1, 2]);
         let registry = Registry::of(&[dir.path()]);

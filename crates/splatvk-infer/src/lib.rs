@@ -1,8 +1,8 @@
 //! ONNX inference: sessions, model registry, one file per model family.
 //!
-//! Networks that users bring are recognised by what goes in and comes out: [`onnx`] reads a file's
-//! header, [`contract`] states what splatvk requires of each part of a model, [`adapter`] maps a
-//! file's names to it, [`graph`] runs it by role.
+//! Networks of users are recognised by their inputs and outputs: [`onnx`] reads a file's header,
+//! [`contract`] states the interface of each part of a model, [`adapter`] maps a file's names to
+//! it, [`graph`] runs it by role.
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]
 
@@ -48,31 +48,32 @@ pub(crate) use splatvk_types::{Error, Result, error, files, math, progress, scen
 use crate::progress::Progress;
 use crate::scene::{Image, RgbImage};
 
-/// The `best` of the rows [P, D] for each of the regions [count, D], by cosine.
+/// Returns, for each of the regions [count, D], the `best` of the rows [P, D] with the largest
+/// cosine, as (row, cosine), best first.
 pub fn nearest(regions: &[f32], rows: &[f32], dim: usize, best: usize) -> Vec<Vec<(usize, f32)>> {
     use rayon::prelude::*;
-    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>();
-    let of = |region: &[f32]| {
-        let mut list: Vec<(usize, f32)> =
-            rows.chunks_exact(dim).map(|row| dot(row, region)).enumerate().collect();
-        list.sort_by(|a, b| b.1.total_cmp(&a.1));
-        list.truncate(best);
-        list
-    };
-    regions.par_chunks_exact(dim).map(of).collect()
+    regions.par_chunks_exact(dim).map(|region| nearest_rows(region, rows, best)).collect()
 }
 
-/// Puts image regions and texts into one space of unit vectors, so that a cosine measures how well
+fn nearest_rows(region: &[f32], rows: &[f32], best: usize) -> Vec<(usize, f32)> {
+    let cosine = |row: &[f32]| row.iter().zip(region).map(|(x, y)| x * y).sum::<f32>();
+    let mut list: Vec<(usize, f32)> = rows.chunks_exact(region.len()).map(cosine).enumerate().collect();
+    list.sort_by(|a, b| b.1.total_cmp(&a.1));
+    list.truncate(best);
+    list
+}
+
+/// Embeds image regions and texts in one space of unit vectors, so that a cosine measures how well
 /// a phrase names a region. Implemented by `words` (the built-in default) and by user-supplied
 /// CLIP-like pairs of towers.
 pub trait RegionEncoder: Send {
-    /// Name of the space; features and texts may be compared only when this agrees.
+    /// Name of the space; only features and texts of one space are comparable.
     fn space(&self) -> &str;
     /// D, the length of every embedding.
     fn dim(&self) -> usize;
     /// [count, D] row-major unit vectors, one per region `0..count` of `labels` (the same size as
     /// `image`; −1 and values ≥ `count` belong to no region). A region without a pixel gets a zero
-    /// row. Asks between what it gives the network at once whether to stop.
+    /// row. Checks between batches whether to stop.
     fn embed_regions(
         &mut self,
         image: &RgbImage,
@@ -82,39 +83,38 @@ pub trait RegionEncoder: Send {
     ) -> Result<Vec<f32>>;
     /// [texts.len(), D] row-major unit vectors.
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>>;
-    /// [N, D] unit rows of [`things::of_form`]; fewer, or none, from an encoder that knows only
-    /// some texts.
-    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+    /// [N, D] unit rows of [`things::of_form`]; fewer or none from an encoder of a limited set of
+    /// texts.
+    fn embed_other_things(&mut self, form: &str) -> Result<Vec<f32>> {
         let list = things::of_form(form);
         self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
     }
-    /// [M, D] unit rows of [`things::recoloured`]; fewer, or none, from an encoder that knows only
-    /// some texts.
-    fn recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
+    /// [M, D] unit rows of [`things::recoloured`]; fewer or none from an encoder of a limited set
+    /// of texts.
+    fn embed_recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
         let list = things::recoloured(text);
         self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
     }
-    /// Whether a text is one whole to the encoder, whatever its words say: an entry of a table.
-    fn holds(&self, _text: &str) -> bool {
+    /// Whether the text is an entry of the encoder's table, which must not be split into words.
+    fn has_table_entry(&self, _text: &str) -> bool {
         false
     }
-    /// Whether a text is among the words that the encoder knows, and which of them is nearest to
-    /// it; `None` from an encoder that is not bound to a list of words.
-    fn nearest_word(&mut self, _text: &str) -> Result<Option<(bool, String)>> {
+    /// Whether a text is in the encoder's vocabulary, and its nearest word there; `None` from an
+    /// encoder without a fixed vocabulary.
+    fn find_nearest_word(&mut self, _text: &str) -> Result<Option<(bool, String)>> {
         Ok(None)
     }
-    /// What gave a text its embedding, of an encoder that has several: a table or a network by
-    /// name.
-    fn embedded_by(&self, _text: &str) -> Option<String> {
+    /// Name of the table or network that embedded a text; `None` from an encoder with a single one.
+    fn embedding_source(&self, _text: &str) -> Option<String> {
         None
     }
-    /// What is doubtful about the embeddings given so far.
-    fn doubt(&self) -> Option<String> {
+    /// Warning about the embeddings returned so far, if they may be of another space.
+    fn embedding_warning(&self) -> Option<String> {
         None
     }
     /// Per region embedding ([count, D] rows) the `best` phrases of the encoder's own vocabulary,
-    /// with their cosine, best first. None from an encoder that has no list of phrases.
-    fn names(&mut self, regions: &[f32], _best: usize) -> Result<Vec<Vec<(String, f32)>>> {
+    /// with their cosine, best first; empty lists from an encoder without one.
+    fn name_regions(&mut self, regions: &[f32], _best: usize) -> Result<Vec<Vec<(String, f32)>>> {
         Ok(vec![Vec::new(); regions.len() / self.dim().max(1)])
     }
 }

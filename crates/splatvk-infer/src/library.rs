@@ -14,7 +14,7 @@ const LIBRARY: &str = "onnxruntime.dll";
 #[cfg(not(any(target_os = "macos", windows)))]
 const LIBRARY: &str = "libonnxruntime.so";
 
-/// The library's path and the environment made with it, or what went wrong.
+/// The library's path and its environment, or the error of loading it.
 static LOADED: OnceLock<Result<(PathBuf, Environment), String>> = OnceLock::new();
 
 /// The library in use, loaded on the first call: `ORT_DYLIB_PATH`, else `lib` under [`home`], else

@@ -1,4 +1,4 @@
-//! Geometry networks that see all photos in one call (VGGT, Depth Anything 3, MapAnything): depth
+//! Geometry networks that take all photos in one call (VGGT, Depth Anything 3, MapAnything): depth
 //! and cameras, from which the pointmaps of every pair follow.
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
@@ -52,16 +52,16 @@ pub(super) fn pointmaps(graph: &GraphFile, photos: &[Photo], progress: &dyn Prog
         .iter()
         .zip(depth.chunks_exact(pixels))
         .map(|(camera, depth)| {
-            let at = |(p, z): (usize, &f32)| {
+            let unproject = |(p, z): (usize, &f32)| {
                 let pixel = DVec2::new((p % width) as f64 + 0.5, (p / width) as f64 + 0.5);
                 camera.unproject(pixel, f64::from(*z))
             };
-            depth.iter().enumerate().map(at).collect()
+            depth.iter().enumerate().map(unproject).collect()
         })
         .collect();
-    // The alignment counts from 1 = "no idea"; a scale that starts below is moved there.
+    // The alignment expects confidences from 1 on; a scale that starts below is shifted.
     let lift = 1.0 - confidence.iter().fold(1f32, |least, c| least.min(*c));
-    let map = |seen: usize, by: usize| Pointmap {
+    let pointmap = |seen: usize, by: usize| Pointmap {
         points: worlds[seen].iter().map(|x| cameras[by].pose.transform(*x).as_vec3().to_array()).collect(),
         confidence: confidence[seen * pixels..(seen + 1) * pixels].iter().map(|c| c + lift).collect(),
     };
@@ -71,10 +71,10 @@ pub(super) fn pointmaps(graph: &GraphFile, photos: &[Photo], progress: &dyn Prog
         pairs.add(PairPointmaps {
             first: i,
             second: j,
-            x11: map(i, i),
-            x21: map(j, i),
-            x22: map(j, j),
-            x12: map(i, j),
+            x11: pointmap(i, i),
+            x21: pointmap(j, i),
+            x22: pointmap(j, j),
+            x12: pointmap(i, j),
             descriptors: None,
         });
     }
@@ -84,7 +84,7 @@ pub(super) fn pointmaps(graph: &GraphFile, photos: &[Photo], progress: &dyn Prog
     Ok(Pointmaps { views, pairs, cameras, confidence_floor })
 }
 
-/// All photos at the first one's input size, since they share a tensor.
+/// Preprocesses all photos; sizes must be equal, since they share a tensor.
 fn same_size(graph: &GraphFile, photos: &[Photo]) -> Result<Vec<Prepared>> {
     let mut prepared = super::prepare::inputs(graph, "images", photos)?;
     let Some((width, height)) = prepared.first().map(|p| (p.width, p.height)) else { return Ok(prepared) };
@@ -116,13 +116,13 @@ fn cameras(outputs: &mut Outputs, graph: &GraphFile, count: usize, size: (usize,
             all.extend([0.5 * w / (0.5 * c[8]).tan(), 0.5 * h / (0.5 * c[7]).tan(), 0.5 * w, 0.5 * h]);
         }
     } else {
-        let (pose, lens) = (outputs.take("extrinsics")?, outputs.take("intrinsics")?);
+        let (pose, intrinsics) = (outputs.take("extrinsics")?, outputs.take("intrinsics")?);
         let stride = pose.data.len() / count.max(1);
-        for (p, k) in pose.data.chunks_exact(stride.max(12)).zip(lens.data.chunks_exact(9)) {
+        for (p, k) in pose.data.chunks_exact(stride.max(12)).zip(intrinsics.data.chunks_exact(9)) {
             all.extend((0..3).flat_map(|r| p[4 * r..4 * r + 3].to_vec()));
             all.extend([p[3], p[7], p[11]]);
-            let shift = (0.5 - graph.binding.pixel_centre) as f32;
-            all.extend([k[0], k[4], k[2] + shift, k[5] + shift]);
+            let offset = (0.5 - graph.binding.pixel_centre) as f32;
+            all.extend([k[0], k[4], k[2] + offset, k[5] + offset]);
         }
     }
     if all.len() != 16 * count || all.iter().any(|v| !v.is_finite()) {

@@ -1,6 +1,6 @@
-//! The header of an ONNX file, read without its weights: inputs, outputs, operator set, and which
-//! files hold the rest. A file of several gigabytes is looked at in milliseconds, and a truncated
-//! one is found out before it is loaded.
+//! Reads the header of an ONNX file without its weights: inputs, outputs, operator set, and files
+//! with external weights. This takes milliseconds for files of several gigabytes and detects
+//! truncated files before they are loaded.
 //!
 //! Field numbers are those of the published onnx.proto3.
 use std::collections::HashSet;
@@ -25,14 +25,14 @@ pub enum ElementType {
 /// One axis of a tensor.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Dim {
-    /// So long.
+    /// Fixed length.
     Fixed(usize),
-    /// Decided when the graph runs.
+    /// Length known when the graph runs.
     Free,
 }
 
 impl Dim {
-    /// The length, where the file fixes it.
+    /// The length, if the file fixes it.
     pub fn length(&self) -> Option<usize> {
         match self {
             Dim::Fixed(n) => Some(*n),
@@ -71,9 +71,9 @@ impl fmt::Display for Port {
 pub struct Header {
     /// Version of the standard operators.
     pub opset: i64,
-    /// What must be fed.
+    /// Its inputs.
     pub inputs: Vec<Port>,
-    /// What comes out.
+    /// Its outputs.
     pub outputs: Vec<Port>,
     /// Files with weights, beside this one.
     pub external: Vec<PathBuf>,
@@ -81,11 +81,11 @@ pub struct Header {
     pub parameters: u64,
 }
 
-/// Most axes of a tensor and outputs of a graph: real ones have some tens. A few bytes in the file
-/// take fifty in memory.
+/// Largest number of axes of a tensor and of outputs of a graph: real ones have some tens. A few
+/// bytes in the file take fifty in memory.
 const MOST_PARTS: usize = 1 << 12;
-/// Most weights of a graph, which old files list among the inputs: the largest language models have
-/// some thousands.
+/// Largest number of weights of a graph, which old files list among the inputs: the largest
+/// language models have some thousands.
 const MOST_WEIGHTS: usize = 1 << 17;
 
 /// A field of a protobuf message.
@@ -127,7 +127,7 @@ impl Reader {
         self.file.seek_relative(i64::try_from(n).ok()?).ok()
     }
 
-    /// The next field's number and, for bytes, the reader left at their start.
+    /// Reads the next field's number and value; for bytes, stops at their start.
     fn field(&mut self) -> Option<(u64, Field)> {
         let key = self.number()?;
         let field = match key & 7 {
@@ -144,8 +144,7 @@ impl Reader {
         Some((key >> 3, field))
     }
 
-    /// Calls `each` for every field of the next `length` bytes; what `each` does not read is
-    /// skipped.
+    /// Calls `each` for every field of the next `length` bytes; bytes that it leaves are skipped.
     fn message(
         &mut self,
         length: u64,
@@ -168,7 +167,7 @@ impl Reader {
     }
 
     fn text(&mut self, n: u64) -> Option<String> {
-        // Names and keys; nothing that is read here is longer.
+        // Limit of names and keys.
         let mut bytes = vec![0; usize::try_from(n).ok().filter(|n| *n < 1 << 16)?];
         self.file.read_exact(&mut bytes).ok()?;
         self.at += n;
@@ -226,7 +225,7 @@ impl Reader {
         Some(dims)
     }
 
-    /// A weight: its name, its number of values, and the file that holds it, if not this one.
+    /// Reads a weight: name, number of values, and file, if external.
     fn weight(&mut self, length: u64) -> Option<(String, u64, Option<String>)> {
         let (mut name, mut values, mut place) = (String::new(), 1u64, None);
         self.message(length, &mut |r, number, field| {
@@ -261,17 +260,13 @@ impl Reader {
     }
 }
 
-/// Reads the header of an ONNX file; the error names the file and says what is wrong with it.
+/// Reads the header of an ONNX file; the error names the file and the fault.
 pub fn read(path: &Path) -> Result<Header> {
     let (file, size) = files::open(path)?;
     let mut reader = Reader { file: BufReader::new(file), at: 0, size };
-    let header = whole(&mut reader, path).filter(|h| !h.inputs.is_empty() && !h.outputs.is_empty());
+    let header = read_header(&mut reader, path).filter(|h| !h.inputs.is_empty() && !h.outputs.is_empty());
     let folder = path.parent().unwrap_or(Path::new(""));
-    let beside = |p: &&PathBuf| {
-        let inside = p.strip_prefix(folder);
-        inside.is_ok_and(|p| p.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)))
-    };
-    if let Some(other) = header.iter().flat_map(|h| &h.external).find(|p| !beside(p)) {
+    if let Some(other) = header.iter().flat_map(|h| &h.external).find(|p| !is_inside(p, folder)) {
         return Err(Error::missing_model(
             path.display(),
             format!(
@@ -291,7 +286,13 @@ pub fn read(path: &Path) -> Result<Header> {
     })
 }
 
-fn whole(reader: &mut Reader, path: &Path) -> Option<Header> {
+/// Whether a path leads into a folder without `..`.
+fn is_inside(path: &Path, folder: &Path) -> bool {
+    let inside = path.strip_prefix(folder);
+    inside.is_ok_and(|p| p.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)))
+}
+
+fn read_header(reader: &mut Reader, path: &Path) -> Option<Header> {
     let mut header = Header::default();
     let mut weights = HashSet::new();
     let mut places = HashSet::new();
@@ -341,7 +342,7 @@ fn whole(reader: &mut Reader, path: &Path) -> Option<Header> {
     Some(header)
 }
 
-/// "a [1×3×?×?], b [?×77]"
+/// Lists ports as "a [1×3×?×?], b [?×77]".
 pub fn listed(ports: &[Port]) -> String {
     ports.iter().map(Port::to_string).collect::<Vec<_>>().join(", ")
 }

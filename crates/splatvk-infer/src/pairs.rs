@@ -1,6 +1,6 @@
-//! Geometry networks: DUSt3R and MASt3R see two photos at a time, VGGT and its like all of them.
-//! Both give pointmaps of pairs ([`PairPointmaps`]), which `pose::pointmap` of splatvk brings to
-//! one scene.
+//! Geometry networks: DUSt3R and MASt3R take two photos at a time, VGGT and similar ones all
+//! photos. Both give pointmaps of pairs ([`PairPointmaps`]), which `pose::pointmap` of splatvk
+//! aligns.
 use super::best_pairs::BestPairs;
 use super::cache::OutputKey;
 use super::contract::Part;
@@ -15,7 +15,7 @@ use crate::scene::{Descriptors, PairPointmaps, Pointmap, Pointmaps};
 use crate::{Error, Result};
 
 /// Pointmaps of pairs of photos, for `pose::pointmap::reconstruct` of splatvk: all pairs of up to
-/// four; of more, those that show most in common.
+/// four photos, of more those with the largest overlap.
 pub fn pointmaps(model: &Installed, photos: &[Photo], progress: &dyn Progress) -> Result<Pointmaps> {
     if let Ok(graph) = model.graph(Part::MultiView) {
         let _turn = graph.compute.turn();
@@ -38,7 +38,7 @@ pub(super) fn inputs_of(model: &Installed, photos: &[Photo]) -> Result<Vec<Prepa
     }
 }
 
-/// What a pair network says of every pair of photos, one after another.
+/// Runs a pair network on every pair of photos in both orders and passes the pairs to `take`.
 pub(super) fn decode_all(
     model: &Installed,
     prepared: &[Prepared],
@@ -49,7 +49,7 @@ pub(super) fn decode_all(
     let _turn = compute.turn();
     let count = prepared.len();
     let mut network = Network::new(model, prepared);
-    let mut sense = Sense { model, judged: 0, crossed: 0 };
+    let mut check = OutputCheck { model, compared: 0, swapped: 0 };
     let ordered = (count * count.saturating_sub(1)) as u64;
     progress.begin("pointmaps", ordered);
     let mut done = 0;
@@ -71,13 +71,13 @@ pub(super) fn decode_all(
             let ([x11, x21], [x22, x12]) = (one.maps, two.maps);
             let pair = PairPointmaps { first: i, second: j, x11, x21, x22, x12, descriptors };
             if !model.untrained() {
-                sense.see(&pair, [&prepared[i], &prepared[j]])?;
+                check.add(&pair, [&prepared[i], &prepared[j]])?;
             }
             take(pair);
         }
     }
     progress.end();
-    sense.verdict()
+    check.finish()
 }
 
 /// One decoding: first and second view, both in the first camera.
@@ -86,7 +86,7 @@ struct Decoded {
     descriptors: [Option<Descriptors>; 2],
 }
 
-/// A pair network of one or two graphs; loaded when the first answer is not in the cache.
+/// A pair network of one or two graphs; loaded when an output is not in the cache.
 struct Network<'a> {
     model: &'a Installed,
     prepared: &'a [Prepared],
@@ -120,13 +120,12 @@ impl<'a> Network<'a> {
     fn forward(&mut self, i: usize, j: usize) -> Result<Outputs> {
         if let Ok(file) = self.model.graph(Part::Pair) {
             let graph = loaded(&mut self.graph, file)?;
-            let shape = |p: &Prepared| Input::I64(vec![1, 2], vec![p.height as i64, p.width as i64]);
             let (a, b) = (&self.prepared[i], &self.prepared[j]);
             return graph.run(vec![
                 ("image1", a.input()),
                 ("image2", b.input()),
-                ("shape1", shape(a)),
-                ("shape2", shape(b)),
+                ("shape1", true_shape(a)),
+                ("shape2", true_shape(b)),
             ]);
         }
         self.encode_all()?;
@@ -143,15 +142,15 @@ impl<'a> Network<'a> {
         graph.run(fed)
     }
 
-    /// Every photo once, with the encoder alone in memory.
+    /// Encodes every photo once, with only the encoder in memory.
     fn encode_all(&mut self) -> Result<()> {
         if self.tokens.iter().all(Option::is_some) {
             return Ok(());
         }
         let mut encoder = self.model.graph(Part::PairEncoder)?.load()?;
         for (slot, ready) in self.tokens.iter_mut().zip(self.prepared) {
-            let shape = Input::I64(vec![1, 2], vec![ready.height as i64, ready.width as i64]);
-            *slot = Some(encoder.run(vec![("image", ready.input()), ("shape", shape)])?.take("tokens")?);
+            let inputs = vec![("image", ready.input()), ("shape", true_shape(ready))];
+            *slot = Some(encoder.run(inputs)?.take("tokens")?);
         }
         Ok(())
     }
@@ -165,9 +164,14 @@ fn loaded<'g>(slot: &'g mut Option<Graph>, file: &GraphFile) -> Result<&'g mut G
     Ok(slot.insert(graph))
 }
 
-/// (row, column) of every patch, for graphs that ask for it.
+/// Height and width of an input, [1, 2].
+fn true_shape(ready: &Prepared) -> Input {
+    Input::I64(vec![1, 2], vec![ready.height as i64, ready.width as i64])
+}
+
+/// (row, column) of every patch, for graphs with this input.
 fn positions(ready: &Prepared) -> Input {
-    // Patches of 16: what every network of this kind uses.
+    // Every network of this kind has patches of 16 pixels.
     let (columns, rows) = (ready.width / 16, ready.height / 16);
     let at = (0..rows as i64).flat_map(|y| (0..columns as i64).flat_map(move |x| [y, x])).collect();
     Input::I64(vec![1, rows * columns, 2], at)
@@ -183,11 +187,11 @@ fn pack(mut outputs: Outputs) -> Result<Vec<f32>> {
         all.extend(outputs.take(points)?.data);
         if let Some(d) = outputs.maybe(desc) {
             all[0] = d.shape.last().copied().unwrap_or_default() as f32;
-            // Without a confidence of its own a descriptor is as sure as its point.
-            let sure = outputs.maybe(desc_conf).map_or_else(|| conf.clone(), |t| t.data);
+            // Without its own confidence a descriptor has that of its point.
+            let desc_conf = outputs.maybe(desc_conf).map_or_else(|| conf.clone(), |t| t.data);
             all.extend(&conf);
             all.extend(d.data);
-            all.extend(sure);
+            all.extend(desc_conf);
         } else {
             all.extend(&conf);
         }
@@ -197,77 +201,79 @@ fn pack(mut outputs: Outputs) -> Result<Vec<f32>> {
 
 fn unpack(values: &[f32], size: [&Prepared; 2]) -> Option<Decoded> {
     let (dim, mut rest) = (*values.first()? as usize, values.get(1..)?);
-    let mut take = |n: usize| {
+    let mut take_values = |n: usize| {
         let (head, tail) = rest.split_at_checked(n)?;
         rest = tail;
         Some(head.to_vec())
     };
-    let mut view = |p: &Prepared| {
+    let mut take_view = |p: &Prepared| {
         let pixels = p.width * p.height;
-        let points = bytemuck::pod_collect_to_vec(&take(3 * pixels)?);
-        let map = Pointmap { points, confidence: take(pixels)? };
+        let points = bytemuck::pod_collect_to_vec(&take_values(3 * pixels)?);
+        let map = Pointmap { points, confidence: take_values(pixels)? };
         if dim == 0 {
             return Some((map, None));
         }
-        let mut data = take(dim * pixels)?;
+        let mut data = take_values(dim * pixels)?;
         data.chunks_exact_mut(dim).for_each(super::text::normalise);
-        Some((map, Some(Descriptors { dim, data, confidence: take(pixels)? })))
+        Some((map, Some(Descriptors { dim, data, confidence: take_values(pixels)? })))
     };
-    let ((a, da), (b, db)) = (view(size[0])?, view(size[1])?);
+    let ((a, da), (b, db)) = (take_view(size[0])?, take_view(size[1])?);
     rest.is_empty().then_some(Decoded { maps: [a, b], descriptors: [da, db] })
 }
 
-/// Refuses output that a trained network cannot give: an activation that the export left out, or
-/// outputs in the wrong order.
-struct Sense<'a> {
+/// Detects outputs that a trained network cannot give: an activation is missing in the export, or
+/// outputs are swapped.
+struct OutputCheck<'a> {
     model: &'a Installed,
-    judged: usize,
-    crossed: usize,
+    compared: usize,
+    swapped: usize,
 }
 
-impl Sense<'_> {
-    fn wrong(&self, what: &str, mend: &str) -> Error {
-        let message = format!("{}: model {}: {what}; {mend}", self.model.folder.display(), self.model.name);
+impl OutputCheck<'_> {
+    fn error(&self, fault: &str, remedy: &str) -> Error {
+        let message =
+            format!("{}: model {}: {fault}; {remedy}", self.model.folder.display(), self.model.name);
         Error::missing_model(&self.model.name, message)
     }
 
-    fn see(&mut self, pair: &PairPointmaps, size: [&Prepared; 2]) -> Result<()> {
+    fn add(&mut self, pair: &PairPointmaps, size: [&Prepared; 2]) -> Result<()> {
         let raw = "either two outputs are swapped or the export left an activation to the program: say apply.points = \
                    \"expm1-norm\" and apply.conf = \"one-plus-exp\" in its adapter (docs/use/models.md)";
         for map in [&pair.x11, &pair.x21, &pair.x22, &pair.x12] {
             // 1 + e^x rounds to 1 at least.
             if map.confidence.iter().any(|c| *c < 0.999) {
-                return Err(self.wrong("a confidence is below 1", raw));
+                return Err(self.error("a confidence is below 1", raw));
             }
         }
         for (own, other, ready) in [(&pair.x11, &pair.x21, size[0]), (&pair.x22, &pair.x12, size[1])] {
             let ahead = own.points.iter().filter(|p| p[2] > 0.0).count();
             if 2 * ahead < own.points.len() {
-                return Err(self.wrong("most points lie behind the camera that sees them", raw));
+                return Err(self.error("most points lie behind the camera that sees them", raw));
             }
             if own.points.len() == other.points.len() {
                 // Seen from the first camera, only the first view's points lie on the rays of its
                 // pixels.
-                let [a, b] = [own, other].map(|m| off_the_rays(m, ready.width, ready.height));
-                self.judged += 1;
-                self.crossed += usize::from(b < 0.05 && a > 2.0 * b);
+                let [a, b] = [own, other].map(|m| ray_residual(m, ready.width, ready.height));
+                self.compared += 1;
+                self.swapped += usize::from(b < 0.05 && a > 2.0 * b);
             }
         }
         Ok(())
     }
 
-    fn verdict(&self) -> Result<()> {
-        if 2 * self.crossed <= self.judged {
+    fn finish(&self) -> Result<()> {
+        if 2 * self.swapped <= self.compared {
             return Ok(());
         }
-        let mend = "swap names.points1 with names.points2 in its adapter, and with them conf and desc (docs/use/models.md)";
-        Err(self.wrong("the second view's points lie on the first view's rays, so the two are swapped", mend))
+        let remedy = "swap names.points1 with names.points2 in its adapter, and with them conf and desc (docs/use/models.md)";
+        Err(self
+            .error("the second view's points lie on the first view's rays, so the two are swapped", remedy))
     }
 }
 
-/// How far points project from their own pixels with the focal length that suits them best: median,
-/// in widths of the picture.
-fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
+/// Median distance of projected points from their own pixels with the best focal length, in image
+/// widths.
+fn ray_residual(map: &Pointmap, width: usize, height: usize) -> f64 {
     let centre = [0.5 * width as f64, 0.5 * height as f64];
     // (slopes of the point's ray, pixel from the centre)
     let rays: Vec<([f64; 2], [f64; 2])> = map
@@ -281,7 +287,7 @@ fn off_the_rays(map: &Pointmap, width: usize, height: usize) -> f64 {
         })
         .collect();
     let dot = |a: [f64; 2], b: [f64; 2]| a[0] * b[0] + a[1] * b[1];
-    // The ray along the axis does not determine it.
+    // The ray along the optical axis gives no finite ratio.
     let mut ratios: Vec<f64> = rays.iter().map(|(s, p)| dot(*s, *p) / dot(*s, *s)).collect();
     ratios.retain(|r| r.is_finite());
     let Some(focal) = median(&mut ratios) else { return f64::INFINITY };
@@ -301,9 +307,9 @@ mod tests {
     use splatvk_test_support::onnx::{Attribute, FLOAT, Onnx};
     use splatvk_test_support::toys::photo;
 
-    /// Pointmaps of 64 × 48 pixels from one graph, which knows the two views by the brightness of
-    /// its first input: the points of the dark and of the light view, in their own camera and in
-    /// the other's, at `ports`, all as sure.
+    /// Graph that gives pointmaps of 64 × 48 pixels at `ports`: the points of the dark or of the
+    /// light view, selected by the brightness of its first input, in their own camera and in the
+    /// other's, all with one confidence.
     fn graph(own: &[Vec<f32>; 2], other: &[Vec<f32>; 2], ports: [&str; 2], sure: f32) -> Onnx {
         let dims = [1, 48, 64, 3];
         let mut graph = Onnx::new().input("img1", FLOAT, "1 3 48 64").input("img2", FLOAT, "1 3 48 64");
@@ -336,34 +342,34 @@ mod tests {
 
     /// The true pointmaps of two breakfast views.
     #[test]
-    fn swapped_pointmaps_are_seen_by_the_rays_they_lie_on() {
+    fn pointmaps_swapped_outputs_are_refused() {
         let views = breakfast::train_views();
         let (w, h) = (64usize, 48);
         // View k in the camera of view c, every tenth pixel.
         let points = |k: usize, c: usize| -> Vec<f32> {
             let to = views[c].camera.pose.compose(&views[k].camera.pose.inverse());
-            let at = |p: usize| {
+            let point = |p: usize| {
                 let (x, y) = (10 * (p % w) + 5, 10 * (p / w) + 5);
                 let camera = Camera { pose: Pose::IDENTITY, ..views[k].camera.clone() };
                 let pixel = glam::DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
                 to.transform(camera.unproject(pixel, f64::from(views[k].depth.at(x, y)))).as_vec3().to_array()
             };
-            (0..w * h).flat_map(at).collect()
+            (0..w * h).flat_map(point).collect()
         };
         let [own, other] = [[points(0, 0), points(1, 1)], [points(1, 0), points(0, 1)]];
         let dir = tempfile::tempdir().unwrap();
-        let ask = |ports: [&str; 2]| {
+        let run_with = |ports: [&str; 2]| {
             graph(&own, &other, ports, 5.0).write(&dir.path().join("dust3r/model.onnx"));
             let model = Registry::of(&[dir.path()]).installed(Task::Geometry, "dust3r").unwrap();
             pointmaps(&model, &dark_and_light(), &Silent).map(drop)
         };
-        ask(["pts3d_1", "pts3d_2"]).unwrap();
-        let error = ask(["pts3d_2", "pts3d_1"]).unwrap_err().to_string();
+        run_with(["pts3d_1", "pts3d_2"]).unwrap();
+        let error = run_with(["pts3d_2", "pts3d_1"]).unwrap_err().to_string();
         assert!(error.contains("swap names.points1 with names.points2"), "{error}");
     }
 
     #[test]
-    fn a_confidence_that_lacks_its_activation_is_refused_with_the_mend() {
+    fn pointmaps_raw_confidence_is_refused() {
         let points = vec![1.0; 3 * 48 * 64];
         let ahead = [points.clone(), points];
         let dir = tempfile::tempdir().unwrap();
@@ -374,18 +380,17 @@ mod tests {
     }
 
     /// A tilted wall in front of two cameras, every point on the ray through the centre of its
-    /// pixel: where the photo shows that point is known, and half a pixel of the network would be
-    /// five of the photo.
+    /// pixel; an offset of half a network pixel would be five pixels of the photo.
     #[test]
-    fn points_of_a_pair_network_are_those_of_the_centres_of_its_pixels() {
+    fn pointmaps_use_pixel_centres() {
         let (w, h) = (64usize, 48);
-        let at = |centre: f64, angle: f64| {
+        let camera = |centre: f64, angle: f64| {
             let rotation = glam::DMat3::from_rotation_y(angle);
             let pose = Pose { rotation, translation: -(rotation * glam::DVec3::X * centre) };
             let name = String::new();
             Camera { name, width: 640, height: 480, fx: 700.0, fy: 700.0, cx: 320.0, cy: 240.0, pose }
         };
-        let cameras = [at(0.0, 0.0), at(0.6, 0.15)];
+        let cameras = [camera(0.0, 0.0), camera(0.6, 0.15)];
         // World points of the plane z = 4 + 0.4 x that the centres of the network's pixels show.
         let world = |k: usize, p: usize| {
             let pixel = glam::DVec2::new((p % w) as f64 + 0.5, (p / w) as f64 + 0.5) * 10.0;

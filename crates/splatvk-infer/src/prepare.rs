@@ -1,4 +1,4 @@
-//! Photo → network input, with the map between their pixels.
+//! Preprocesses photos to network inputs, with the map between their pixels.
 use super::adapter::{Filter, Fit, ImageSpec};
 use super::graph::GraphFile;
 use super::runtime::Input;
@@ -8,14 +8,14 @@ use crate::scene::resize::Kernel;
 use crate::scene::{Affine, ModelView, RgbImage};
 use crate::{Error, Result};
 
-/// A photo as a network sees it.
+/// A photo as network input.
 #[derive(Clone, Debug)]
 pub struct Prepared {
     /// Input width, pixels.
     pub width: usize,
     /// Input height, pixels.
     pub height: usize,
-    /// Width of the part that shows the photo; the rest is padding.
+    /// Width and height of the part that shows the photo; the rest is padding.
     pub filled: [usize; 2],
     /// [3, H, W], normalised.
     pub data: Vec<f32>,
@@ -30,15 +30,14 @@ impl Prepared {
     }
 }
 
-/// Brings a photo to the size, aspect and range that a graph takes. `role` is the graph's image
-/// input.
+/// Converts a photo to the size, aspect and range of a graph. `role` is the graph's image input.
 pub fn prepare(image: &RgbImage, graph: &GraphFile, spec: &ImageSpec, role: &str) -> Prepared {
     let fixed = graph.fixed(role, "W").zip(graph.fixed(role, "H"));
     let (from_w, from_h) = (image.width as f64, image.height as f64);
     let round = |n: f64| (n.round_ties_even() as usize).max(1);
     let down = |n: usize| (n / spec.multiple).max(1) * spec.multiple;
     let long = spec.size as f64 / from_w.max(from_h);
-    // The photo is resized to `inner`, of which the middle, or all and padding, becomes `outer`.
+    // The photo is resized to `inner`, then cropped or padded to `outer`.
     let (inner, outer) = match (spec.fit, fixed) {
         (Fit::Squash, fixed) => {
             let outer = fixed.unwrap_or((down(spec.size), down(spec.size)));
@@ -71,9 +70,7 @@ pub fn prepare(image: &RgbImage, graph: &GraphFile, spec: &ImageSpec, role: &str
         (Filter::Lanczos, true) => Kernel::Lanczos,
     };
     let small = image.resized(inner.0, inner.1, kernel);
-    let cut =
-        |inner: usize, outer: usize| (inner / 2).saturating_sub(outer / 2).min(inner.saturating_sub(outer));
-    let (x0, y0) = (cut(inner.0, outer.0), cut(inner.1, outer.1));
+    let (x0, y0) = (crop_start(inner.0, outer.0), crop_start(inner.1, outer.1));
     let filled = [inner.0.min(outer.0), inner.1.min(outer.1)];
     let mut data = vec![0f32; 3 * outer.0 * outer.1];
     for c in 0..3 {
@@ -89,7 +86,12 @@ pub fn prepare(image: &RgbImage, graph: &GraphFile, spec: &ImageSpec, role: &str
     Prepared { width: outer.0, height: outer.1, filled, data, from_photo }
 }
 
-/// Every photo as the graph sees it.
+/// First pixel of a centred crop from `inner` to `outer` pixels; 0 with padding.
+fn crop_start(inner: usize, outer: usize) -> usize {
+    (inner / 2).saturating_sub(outer / 2).min(inner.saturating_sub(outer))
+}
+
+/// Preprocesses every photo for a graph.
 pub(super) fn inputs(graph: &GraphFile, role: &str, photos: &[Photo]) -> Result<Vec<Prepared>> {
     let spec =
         graph.binding.image.as_ref().ok_or_else(|| {
@@ -98,7 +100,7 @@ pub(super) fn inputs(graph: &GraphFile, role: &str, photos: &[Photo]) -> Result<
     Ok(photos.iter().map(|p| prepare(&p.image, graph, spec, role)).collect())
 }
 
-/// The views of `pose::pointmap` of splatvk; warns of what a crop cost.
+/// Views for `pose::pointmap` of splatvk; warns if a crop loses more than 10 % of a photo.
 pub(super) fn views(photos: &[Photo], prepared: &[Prepared], progress: &dyn Progress) -> Vec<ModelView> {
     let mut groups: Vec<(Option<&str>, (u32, u32))> = Vec::new();
     let mut lost = 0.0f64;
@@ -123,7 +125,7 @@ pub(super) fn views(photos: &[Photo], prepared: &[Prepared], progress: &dyn Prog
             camera_group,
         });
     }
-    // A few rows go with the rounding to whole patches.
+    // Rounding to whole patches loses a few rows.
     if lost > 0.1 {
         progress.warn(&format!(
             "the geometry network's input cuts {:.0} % off a photo; an export for another aspect would use all of it",
@@ -140,7 +142,7 @@ mod tests {
     use splatvk_test_support::toys::photo;
 
     #[test]
-    fn a_focal_length_of_the_file_is_given_in_the_pixels_of_the_network() {
+    fn views_scale_exif_focal() {
         let image = RgbImage { width: 64, height: 32, data: vec![[0.5; 3]; 64 * 32] };
         let photos = [Photo { exif_focal: Some(80.0), ..photo("a", image.clone()) }, photo("b", image)];
         let from_photo = Affine { scale: [0.5; 2], offset: [0.0; 2] };

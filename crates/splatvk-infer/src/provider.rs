@@ -1,5 +1,5 @@
-//! Execution providers of ONNX Runtime: which device computes the networks. The CPU always can; a
-//! GPU does when the installed library was built for it and answers.
+//! Execution providers of ONNX Runtime. The CPU is always available, a GPU if the installed library
+//! was built for it and a test graph runs on it.
 #[cfg(feature = "networks")]
 use ort::ep;
 use ort::ep::ExecutionProviderDispatch;
@@ -9,13 +9,13 @@ use ort::environment::Environment;
 use ort::session::builder::{GraphOptimizationLevel, SessionBuilder};
 use ort::value::Tensor as OrtTensor;
 
-/// A way to compute networks other than on the CPU.
+/// An execution provider other than the CPU.
 pub(super) struct Provider {
-    /// What users write.
+    /// Name in options.
     pub(super) name: &'static str,
     listed: fn() -> ort::Result<bool>,
     registration: fn() -> ExecutionProviderDispatch,
-    /// `auto` takes it: where it answers, there is a GPU.
+    /// Whether `auto` selects it: only providers that need a GPU.
     automatic: bool,
 }
 
@@ -29,8 +29,7 @@ impl Provider {
         Provider { name, listed: P::is_available, registration, automatic }
     }
 
-    /// To be put before the CPU in a session; a session that cannot have it is refused, not made
-    /// without it.
+    /// Registration before the CPU; a session without the provider is an error.
     pub(super) fn registration(&self) -> ExecutionProviderDispatch {
         (self.registration)().error_on_failure()
     }
@@ -39,25 +38,25 @@ impl Provider {
 /// Best first.
 #[cfg(feature = "networks")]
 static PROVIDERS: &[Provider] = &[
-    // Shortened products (TF32) move keypoints by more than the poses are exact to.
+    // TF32 products move keypoints by more than the accuracy of the poses.
     Provider::new::<ep::CUDA>("cuda", true, || ep::CUDA::default().with_tf32(false).build()),
     Provider::new::<ep::MIGraphX>("migraphx", true, || ep::MIGraphX::default().build()),
     Provider::new::<ep::ROCm>("rocm", true, || ep::ROCm::default().build()),
     Provider::new::<ep::DirectML>("directml", true, || ep::DirectML::default().build()),
     Provider::new::<ep::CoreML>("coreml", true, || ep::CoreML::default().build()),
     Provider::new::<ep::WebGPU>("webgpu", true, || ep::WebGPU::default().build()),
-    // Answers everywhere, on a CPU no faster than the CPU's own way and with twice its memory.
+    // Also runs on a CPU, no faster than ONNX Runtime's CPU provider and with twice its memory.
     Provider::new::<ep::OpenVINO>("openvino", false, || ep::OpenVINO::default().build()),
 ];
 
 #[cfg(not(feature = "networks"))]
 static PROVIDERS: &[Provider] = &[];
 
-/// What `--provider` and `SPLATVK_PROVIDER` take.
+/// Values of `--provider` and `SPLATVK_PROVIDER`.
 pub const NAMES: [&str; 9] =
     ["auto", "cpu", "cuda", "migraphx", "rocm", "directml", "coreml", "webgpu", "openvino"];
 
-/// The provider that is requested: found by computing a graph of one node on it.
+/// Finds the requested provider and tests it with a graph of one node.
 pub(super) fn find(
     requested: &str,
     note: &mut dyn FnMut(String),
@@ -101,7 +100,7 @@ pub(super) fn find(
     }
 }
 
-/// What went wrong, without the place in ONNX Runtime's source that precedes it.
+/// Message of an error, without the location in ONNX Runtime's source before it.
 fn reason(error: &ort::Error) -> String {
     let text = line(error);
     [" was false. ", " FAIL : "]
@@ -110,7 +109,7 @@ fn reason(error: &ort::Error) -> String {
         .to_owned()
 }
 
-/// What sessions are made with.
+/// Settings of sessions.
 pub(super) fn settings(
     environment: &Environment,
     provider: Option<&Provider>,
@@ -120,15 +119,15 @@ pub(super) fn settings(
     let builder = ort::session::Session::builder(environment)?
         .with_optimization_level(GraphOptimizationLevel::Level3)?
         .with_intra_threads(threads)?
-        // Else threads that wait for the next operator keep all cores busy, which passes on the CPU
-        // and other sessions need.
+        // Spinning threads would keep all cores busy, which passes on the CPU and other sessions
+        // need.
         .with_intra_op_spinning(false)?;
     let mut providers: Vec<_> = provider.iter().map(|p| p.registration()).collect();
     if large {
-        // The arena doubles what it takes and keeps it until the session ends.
+        // The arena doubles its memory and keeps it until the session ends.
         providers.push(ort::ep::CPU::default().with_arena_allocator(false).build());
     }
-    // DirectML refuses memory patterns, too.
+    // DirectML does not support memory patterns.
     Ok(builder.with_memory_pattern(!large && provider.is_none())?.with_execution_providers(providers)?)
 }
 
@@ -139,8 +138,8 @@ const PROBE: &[u8] = b"\x08\x08\x3a\x33\
     \x62\x0f\x0a\x01y\x12\x0a\x0a\x08\x08\x01\x12\x04\x0a\x02\x08\x01\
     \x42\x04\x0a\x00\x10\x11";
 
-/// Computes a graph of one node: a library may list a provider, and even register it, on a machine
-/// without its device.
+/// Runs a graph of one node: a library may list and even register a provider on a machine without
+/// its device.
 fn probe(environment: &Environment, provider: Option<&Provider>) -> ort::Result<()> {
     let mut session = settings(environment, provider, false)?.commit_from_memory(PROBE)?;
     let computed = session.run(ort::inputs!["x" => OrtTensor::from_array(([1usize], vec![2f32]))?])?;
@@ -156,19 +155,19 @@ mod tests {
 
     #[cfg(feature = "networks")]
     #[test]
-    fn every_name_is_a_provider_or_a_rule() {
+    fn names_list_every_provider() {
         let names: Vec<&str> = ["auto", "cpu"].into_iter().chain(PROVIDERS.iter().map(|p| p.name)).collect();
         assert_eq!(names, NAMES);
     }
 
     #[test]
-    fn the_cpu_computes_the_probe() {
+    fn probe_runs_on_cpu() {
         probe(&loaded().expect("tools/setup").1, None).expect("one node");
     }
 
     #[cfg(feature = "networks")]
     #[test]
-    fn what_the_library_lacks_is_refused_with_what_it_has() {
+    fn find_absent_provider_is_refused() {
         loaded().expect("tools/setup");
         // The default pack's library is a CPU build; a tester's own may not be.
         let absent =

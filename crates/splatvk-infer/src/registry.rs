@@ -1,8 +1,6 @@
-//! The default model pack: which files it holds, where they are, and whether they are what they
-//! should be.
+//! The default model pack: its files, their locations and checksums.
 //!
-//! The table is `crates/splatvk-infer/src/pack.json`, the same one that the set-up script builds
-//! from, so the two cannot disagree.
+//! The table is `crates/splatvk-infer/src/pack.json`, which the set-up script also reads.
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
@@ -16,10 +14,10 @@ pub use crate::files::home;
 use crate::{Error, Result};
 
 const PACK: &str = include_str!("pack.json");
-/// What to do about anything that is missing or broken.
+/// Remedy for missing or broken files.
 const FIX: &str = "run tools/setup (or tools/models/build) to get it";
 
-/// What a model file is for.
+/// Purpose of a model file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -38,29 +36,29 @@ pub enum PackFileKind {
     Tokenizer,
 }
 
-/// One file of the pack as found on this machine.
+/// State of one file of the pack on this machine.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct ModelStatus {
-    /// What it is for.
+    /// Its purpose.
     pub kind: PackFileKind,
     /// The model's name.
     pub name: String,
-    /// Where it is, or should be.
+    /// Its path, or where it should be.
     pub file: PathBuf,
-    /// Present with the right content.
+    /// Whether the file is present with the right content.
     pub installed: bool,
-    /// Size it should have.
+    /// Expected size, bytes.
     pub bytes: u64,
-    /// Content it should have.
+    /// Expected sha256.
     pub sha256: String,
-    /// Content it has; `None` when the file is absent or unreadable.
+    /// Actual sha256; `None` when the file is absent or unreadable.
     pub actual_sha256: Option<String>,
     /// SPDX expression.
     pub licence: String,
-    /// Where it comes from.
+    /// Its origin.
     pub source: String,
-    /// What is wrong and what to do; `None` when installed.
+    /// Problem and remedy; `None` when installed.
     pub fix: Option<String>,
 }
 
@@ -102,7 +100,7 @@ impl Registry {
         Registry::with(models_dir, Compute::default())
     }
 
-    /// [`Registry::open`], for networks that are computed like this.
+    /// [`Registry::open`] with execution settings.
     pub fn with(models_dir: Option<&Path>, compute: Compute) -> Result<Self> {
         let pack =
             serde_json::from_str(PACK).map_err(|e| Error::work(format!("built-in model table: {e}")))?;
@@ -116,16 +114,13 @@ impl Registry {
     /// The folders that [`Registry::open`] would search, whether they exist or not.
     pub fn places(models_dir: Option<&Path>) -> Result<Vec<PathBuf>> {
         let set = || std::env::var_os("SPLATVK_MODELS").filter(|v| !v.is_empty());
-        let list = |text: &std::ffi::OsStr| -> Vec<PathBuf> {
-            std::env::split_paths(text).filter(|p| !p.as_os_str().is_empty()).collect()
-        };
-        match models_dir.map(|d| list(d.as_os_str())).or_else(|| set().map(|text| list(&text))) {
+        match models_dir.map(|d| split_list(d.as_os_str())).or_else(|| set().map(|text| split_list(&text))) {
             Some(folders) => Ok(folders),
             None => Ok(vec![home()?.join("models")]),
         }
     }
 
-    /// The same, looking into one folder only.
+    /// The registry restricted to one folder.
     pub fn only(&self, folder: &Path) -> Registry {
         Registry { folders: vec![folder.to_path_buf()], ..self.clone() }
     }
@@ -133,18 +128,18 @@ impl Registry {
     /// Models in these folders only, computed without a cache. For tests.
     #[doc(hidden)]
     pub fn of(folders: &[&Path]) -> Registry {
-        // The table is part of the program; `with` reports it if it is broken.
+        // `with` reports an error of the built-in table.
         let pack = serde_json::from_str(PACK).unwrap_or_default();
         let folders = folders.iter().map(|f| f.to_path_buf()).collect();
         Registry { folders, pack, compute: Compute::default().uncached() }
     }
 
-    /// How the networks are computed.
+    /// Execution settings of the networks.
     pub fn compute(&self) -> &Compute {
         &self.compute
     }
 
-    /// The same models, and everything is computed.
+    /// The registry without the cache of outputs.
     pub fn uncached(&self) -> Registry {
         Registry { compute: self.compute.uncached(), ..self.clone() }
     }
@@ -226,6 +221,11 @@ impl Registry {
     }
 }
 
+/// Folders of a list, written like `PATH`.
+fn split_list(text: &std::ffi::OsStr) -> Vec<PathBuf> {
+    std::env::split_paths(text).filter(|p| !p.as_os_str().is_empty()).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -242,7 +242,7 @@ mod tests {
     }
 
     #[test]
-    fn every_file_of_the_installed_pack_is_sound() {
+    fn status_of_installed_pack_is_sound() {
         for status in Registry::open(None).unwrap().status() {
             assert!(status.installed, "{:?}", status.fix);
             assert_eq!(std::fs::metadata(&status.file).unwrap().len(), status.bytes);
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn missing_truncated_and_corrupt_files_are_named_with_hash_and_remedy() {
+    fn path_errors_state_hash_and_remedy() {
         let dir = copied_pack();
         let registry = Registry::open(Some(dir.path())).unwrap();
         assert!(registry.path(PackFileKind::Classes).is_ok());
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn an_absent_model_folder_is_bad_input() {
+    fn open_absent_folder_is_bad_input() {
         let error = Registry::open(Some(Path::new("/no/such/folder"))).err().unwrap();
         assert_eq!(error.exit_code(), 2);
         assert!(error.to_string().contains("/no/such/folder"));

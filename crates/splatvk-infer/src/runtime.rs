@@ -1,5 +1,4 @@
-//! ONNX Runtime, loaded at run time from a shared library, and sessions with plain tensors in and
-//! out.
+//! Sessions of ONNX Runtime with plain tensors as inputs and outputs.
 use std::path::{Path, PathBuf};
 
 use ort::session::SessionInputValue;
@@ -54,49 +53,55 @@ impl Input {
 
     fn value(self, wanted: Option<TensorElementType>) -> ort::Result<SessionInputValue<'static>> {
         use TensorElementType as T;
-        let floats = |shape: Vec<usize>, data: Vec<f32>| -> ort::Result<SessionInputValue<'static>> {
-            Ok(match wanted {
-                Some(T::Float16) => {
-                    let half: Vec<half::f16> = data.into_iter().map(half::f16::from_f32).collect();
-                    OrtTensor::from_array((shape, half))?.into()
-                }
-                Some(T::Float64) => {
-                    let wide: Vec<f64> = data.into_iter().map(f64::from).collect();
-                    OrtTensor::from_array((shape, wide))?.into()
-                }
-                _ => OrtTensor::from_array((shape, data))?.into(),
-            })
-        };
         match (self, wanted) {
-            (Input::F32(shape, data), _) => floats(shape, data),
+            (Input::F32(shape, data), _) => float_value(shape, data, wanted),
             (Input::I64(shape, data), Some(T::Int32)) => {
                 let narrow: Vec<i32> = data.into_iter().map(|v| v as i32).collect();
                 Ok(OrtTensor::from_array((shape, narrow))?.into())
             }
             (Input::I64(shape, data), Some(T::Float16 | T::Float32 | T::Float64)) => {
-                floats(shape, data.into_iter().map(|v| v as f32).collect())
+                float_value(shape, data.into_iter().map(|v| v as f32).collect(), wanted)
             }
             (Input::I64(shape, data), _) => Ok(OrtTensor::from_array((shape, data))?.into()),
         }
     }
 }
 
+/// Floats in the element type of the graph.
+fn float_value(
+    shape: Vec<usize>,
+    data: Vec<f32>,
+    wanted: Option<TensorElementType>,
+) -> ort::Result<SessionInputValue<'static>> {
+    Ok(match wanted {
+        Some(TensorElementType::Float16) => {
+            let half: Vec<half::f16> = data.into_iter().map(half::f16::from_f32).collect();
+            OrtTensor::from_array((shape, half))?.into()
+        }
+        Some(TensorElementType::Float64) => {
+            let wide: Vec<f64> = data.into_iter().map(f64::from).collect();
+            OrtTensor::from_array((shape, wide))?.into()
+        }
+        _ => OrtTensor::from_array((shape, data))?.into(),
+    })
+}
+
 /// One loaded network. Dropping it frees its memory.
 pub struct Session {
     inner: ort::session::Session,
     file: PathBuf,
-    /// After `inner`, whose memory it hands back: fields are dropped in order.
-    _memory: Option<HandBack>,
+    /// Declared after `inner`, whose memory it returns: fields are dropped in order.
+    _memory: Option<TrimHeapOnDrop>,
 }
 
-/// Makes glibc return freed memory to the system when dropped. It keeps what it can: a loaded
-/// network would occupy twice its weights, a dropped one still once.
-struct HandBack;
+/// Makes glibc return freed memory to the system when dropped. Otherwise a loaded network occupies
+/// twice its weights, and a dropped one once.
+struct TrimHeapOnDrop;
 
-impl Drop for HandBack {
+impl Drop for TrimHeapOnDrop {
     fn drop(&mut self) {
         #[cfg(all(target_os = "linux", target_env = "gnu"))]
-        // SAFETY: no argument has requirements; it locks what it touches.
+        // SAFETY: the function has no preconditions and locks the arenas it changes.
         unsafe {
             libc::malloc_trim(0);
         }
@@ -104,8 +109,7 @@ impl Drop for HandBack {
 }
 
 impl Session {
-    /// Loads a graph for the chosen provider; on the CPU it computes on as many threads as there
-    /// are cores.
+    /// Loads a graph for the chosen provider; on the CPU it has one thread per core.
     pub fn load(file: &Path, compute: &Compute) -> Result<Self> {
         let bytes = file.metadata().map_or(0, |m| m.len());
         Session::load_sized(file, bytes, compute)
@@ -136,9 +140,9 @@ impl Session {
             )
         })?;
         if large {
-            drop(HandBack);
+            drop(TrimHeapOnDrop);
         }
-        Ok(Session { inner, file: file.to_path_buf(), _memory: large.then(|| HandBack) })
+        Ok(Session { inner, file: file.to_path_buf(), _memory: large.then(|| TrimHeapOnDrop) })
     }
 
     /// Runs the graph once and returns the named outputs as 32-bit floats.
@@ -158,13 +162,13 @@ impl Session {
             let value = produced
                 .get(*name)
                 .ok_or_else(|| Error::work(format!("{file}: the graph has no output {name}")))?;
-            tensors.push(floats(value).map_err(failed)?);
+            tensors.push(to_floats(value).map_err(failed)?);
         }
         Ok(tensors)
     }
 }
 
-fn floats(value: &ort::value::DynValue) -> ort::Result<Tensor> {
+fn to_floats(value: &ort::value::DynValue) -> ort::Result<Tensor> {
     use TensorElementType as T;
     let lengths = |shape: &ort::value::Shape| shape.iter().map(|n| *n as usize).collect();
     Ok(match value.dtype().tensor_type() {
@@ -187,6 +191,5 @@ fn floats(value: &ort::value::DynValue) -> ort::Result<Tensor> {
     })
 }
 
-/// Files from this size on, bytes, are networks whose memory counts for more than the time of
-/// allocating it.
+/// Smallest size of a large network, bytes: its memory matters more than the time of allocation.
 const LARGE: u64 = 200 << 20;

@@ -1,5 +1,4 @@
-//! Networks that cut masks out of a photo at a point (SAM, SAM 2 and those that share their
-//! interfaces).
+//! Networks that predict masks at point prompts (SAM, SAM 2 and networks with their interfaces).
 use super::contract::Part;
 use super::graph::{Graph, GraphFile};
 use super::installed::Installed;
@@ -17,13 +16,13 @@ pub struct Sam {
     decoder: Graph,
 }
 
-/// What the encoder made of an image.
+/// Encoder outputs of an image.
 pub struct Encoded {
     ready: Prepared,
     tensors: Vec<(&'static str, Tensor)>,
 }
 
-/// What the decoder answered to some points: three masks each, subpart, part and whole.
+/// Decoder outputs of some points: three masks each, subpart, part and whole.
 pub struct Proposals {
     /// Logit maps [points][3], each `width` × `height`.
     pub logits: Vec<f32>,
@@ -37,7 +36,7 @@ pub struct Proposals {
     pub filled: [f64; 2],
 }
 
-/// Masks of a point; the fourth, where there is one, comes first and is the best single guess.
+/// Masks of a point. A decoder with four gives a single best mask first.
 pub const MASKS: usize = 3;
 
 impl Sam {
@@ -51,7 +50,7 @@ impl Sam {
         Ok(Sam { encoder: model.graph(Part::MaskEncoder)?.load()?, decoder: decoder.load()? })
     }
 
-    /// Looks at an image.
+    /// Encodes an image.
     pub fn encode(&mut self, image: &RgbImage) -> Result<Encoded> {
         let file = &self.encoder.file;
         let spec =
@@ -67,7 +66,7 @@ impl Sam {
         Ok(Encoded { ready, tensors })
     }
 
-    /// Masks at some points of the encoded image (pixels, centre of the first at 0.5); at most
+    /// Predicts masks at points of the encoded image (pixels, centre of the first at 0.5); at most
     /// [`BATCH`].
     pub fn decode(&mut self, image: &Encoded, points: &[[f64; 2]]) -> Result<Proposals> {
         let at_once = self.decoder.file.fixed("points", "P").unwrap_or(points.len()).max(1);
@@ -93,7 +92,7 @@ impl Sam {
         all: &mut Proposals,
     ) -> Result<()> {
         let file = &self.decoder.file;
-        // SAM was trained with a padding point behind a lone point; some graphs add it themselves.
+        // SAM was trained with a padding point after a single point; some graphs add it themselves.
         let padding = usize::from(!file.binding.pads);
         let count = 1 + padding;
         let rows = if file.fixed("points", "P").is_some() { rows } else { points.len() };

@@ -1,5 +1,4 @@
-//! Networks that users bring, as tiny graphs with the same interfaces: what fits is used, what does
-//! not is named.
+//! Tests with tiny graphs that have the interfaces of users' networks.
 use std::path::Path;
 
 use super::catalogue::{CatalogueEntry, catalogue, common_packages};
@@ -33,7 +32,7 @@ fn refused(graph: &Onnx, extra: &[(&str, &str)]) -> String {
 }
 
 #[test]
-fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
+fn clip_towers_are_recognised_and_matched() {
     let dir = tempfile::tempdir().unwrap();
     clip_in(dir.path(), [0, 1, 2]);
     let registry = Registry::of(&[dir.path()]);
@@ -43,7 +42,7 @@ fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
     assert_eq!((clip.dim(), clip.tokens("Red dog").unwrap()), (3, vec![1, 4]));
     assert_eq!(clip.tokens(&("red ".repeat(50) + "dog")).unwrap(), [1, 1, 1, 1, 1, 1, 1, 4], "cut");
 
-    // The left half is green, the right half blue; a label without pixels gets no direction.
+    // The left half is green, the right half blue; a label without pixels has a zero row.
     let (mut image, mut labels) =
         (RgbImage { width: 32, height: 20, data: Vec::new() }, Image::filled(32, 20, 0));
     for p in 0..32 * 20 {
@@ -63,10 +62,9 @@ fn towers_are_recognised_by_their_tensors_and_proven_to_belong_together() {
     assert_eq!(mismatched.exit_code(), 2);
 }
 
-/// Folders from a hub hold both towers in one graph beside the two, and variants whose download
-/// stopped.
+/// Folders from a hub also have both towers in one graph, and incompletely downloaded variants.
 #[test]
-fn a_whole_model_does_without_what_cannot_be_used_beside_it() {
+fn inventory_complete_model_ignores_unusable_files() {
     let dir = tempfile::tempdir().unwrap();
     clip_in(dir.path(), [0, 1, 2]);
     let both = image_tower().input("input_ids", INT64, "batch 8").output("logits_per_image", "batch batch");
@@ -80,14 +78,14 @@ fn a_whole_model_does_without_what_cannot_be_used_beside_it() {
         unused[0].contains("model.onnx: fits no known model") && unused[1].contains("fp16"),
         "{unused:?}"
     );
-    // Without a tower they are all there is, and each says why it is none.
+    // Without a tower, each file is broken and has a reason.
     std::fs::remove_file(dir.path().join("clip_toy/text_model.onnx")).unwrap();
     let found = inventory(&Registry::of(&[dir.path()]));
     assert_eq!((found.models.len(), found.broken.len()), (0, 3), "{:?}", found.broken);
 }
 
 #[test]
-fn towers_of_other_widths_or_checkpoints_are_refused() {
+fn clip_mismatched_towers_are_refused() {
     let dir = tempfile::tempdir().unwrap();
     clip_in(dir.path(), [0, 1, 2]);
     let registry = Registry::of(&[dir.path()]);
@@ -110,7 +108,7 @@ fn towers_of_other_widths_or_checkpoints_are_refused() {
 }
 
 #[test]
-fn a_graph_that_fits_nothing_is_described_with_the_nearest_contract() {
+fn recognise_unknown_graph_states_nearest_contract() {
     let graph = Onnx::new().input("pixel_values", FLOAT, "batch 3 16 16").output("strange", "batch 3").node(
         "ReduceMean",
         "pixel_values",
@@ -123,7 +121,7 @@ fn a_graph_that_fits_nothing_is_described_with_the_nearest_contract() {
     {
         assert!(error.contains(part), "{part}: {error}");
     }
-    // Said in an adapter, the same file is used.
+    // With an adapter, the same file is used.
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("graph.onnx");
     graph.write(&path);
@@ -142,7 +140,7 @@ fn a_graph_that_fits_nothing_is_described_with_the_nearest_contract() {
 }
 
 #[test]
-fn bad_files_are_named_with_the_mend() {
+fn recognise_bad_files_states_remedy() {
     let mut future = image_tower();
     future.opset = 99;
     let error = refused(&future, &[]);
@@ -183,7 +181,7 @@ fn bad_files_are_named_with_the_mend() {
     let error = refused(&image_tower(), &[("adapter.toml", &adapter("00ff"))]);
     let own = sha256(&image_tower().encode());
     assert!(error.contains(&format!("has sha256 {own}, its adapter pins 00ff")), "{error}");
-    // With its own hash the file loads; the NaN is what is refused then.
+    // With its own hash the file loads, and its NaN is refused.
     let error = refused(&nan, &[("adapter.toml", &adapter(&sha256(&nan.encode())))]);
     assert!(error.contains("image_embeds holds NaN"), "{error}");
 
@@ -205,7 +203,7 @@ fn bad_files_are_named_with_the_mend() {
 }
 
 #[test]
-fn swapped_outputs_of_a_mask_decoder_are_seen() {
+fn recognise_swapped_decoder_outputs_fails() {
     let decoder = |masks: &str, scores: &str| {
         Onnx::new()
             .input("image_embeddings", FLOAT, "1 256 64 64")
@@ -225,7 +223,7 @@ fn swapped_outputs_of_a_mask_decoder_are_seen() {
 }
 
 #[test]
-fn the_catalogue_is_sound_and_a_missing_model_is_explained() {
+fn catalogue_is_sound_and_explains_absence() {
     assert!(catalogue().len() >= 12);
     for model in catalogue() {
         assert!(model.source.starts_with("https://") && !model.licence.is_empty(), "{}", model.id);
@@ -258,7 +256,7 @@ fn the_catalogue_is_sound_and_a_missing_model_is_explained() {
     assert!(text.contains("models fetch sam_vit_b"), "of a family the one that needs no export: {text}");
 }
 
-/// Addresses are of https and lead to files; names are such that files cannot leave their folder.
+/// Addresses are https and lead to files; names cannot leave their folder.
 fn sources_are_sound(model: &CatalogueEntry) {
     let weights = model.recipe.iter().flat_map(|r| &r.weights);
     for source in model.files.iter().chain(weights) {
@@ -267,8 +265,7 @@ fn sources_are_sound(model: &CatalogueEntry) {
         assert_eq!(name.file_name(), Some(name.as_os_str()), "{}", source.name);
         let hex = |s: &String| s.len() == 64 && s.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
         assert!(source.sha256.as_ref().is_none_or(hex), "{}", source.from);
-        // Whoever can change a file behind an address without a revision cannot change its
-        // checksum.
+        // Files at addresses without a revision may change, so they have no checksum.
         let fixed =
             source.from.split('/').any(|part| part.len() == 40) || !source.from.contains("huggingface");
         assert!(fixed || source.sha256.is_none(), "{}", source.from);
@@ -281,7 +278,7 @@ fn sources_are_sound(model: &CatalogueEntry) {
 }
 
 #[test]
-fn files_side_by_side_belong_together_by_name_and_the_catalogue_decides_which_is_first() {
+fn inventory_groups_files_by_name() {
     let dir = tempfile::tempdir().unwrap();
     for name in ["sam_vit_b", "sam_vit_h"] {
         Onnx::new()
@@ -307,13 +304,12 @@ fn files_side_by_side_belong_together_by_name_and_the_catalogue_decides_which_is
     assert_eq!(model.graph(Part::MaskDecoder).unwrap().fixed("points", "P"), Some(1));
 }
 
-/// One graph for both views, channels first, raw activations: the adapter says what is left to do.
+/// One graph for both views, channels first, raw activations, which the adapter states.
 #[test]
-fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_the_adapter() {
+fn pair_network_runs_in_both_orders() {
     let (w, h) = (32u64, 16);
     let pixels = (w * h) as usize;
-    // ln 3 along z: e^d − 1 = 2. A mark of the first image's brightness in x tells the two orders
-    // apart.
+    // ln 3 along z: e^d − 1 = 2. The first image's brightness in x marks the order of the images.
     let raw: Vec<f32> = (0..3 * pixels).map(|k| if k / pixels == 2 { 3f32.ln() } else { 0.0 }).collect();
     let mut graph = Onnx::new().input("img1", FLOAT, "1 3 16 32").input("img2", FLOAT, "1 3 16 32");
     for k in ["1", "2"] {
@@ -335,7 +331,7 @@ fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_t
     let grey = |v: f32| RgbImage { width: 64, height: 32, data: vec![[v; 3]; 64 * 32] };
     let photos = [photo("dark", grey(0.5)), photo("light", grey(1.0))];
     let model = registry.installed(Task::Geometry, "dust3r").unwrap();
-    // ln 3 = 1.1 is no confidence of 4, but it is at least 1: nothing to see here yet.
+    // A raw confidence of ln 3 = 1.1 is at least 1 and passes the check.
     let maps = pairs::pointmaps(&model, &photos, &Silent).unwrap();
     assert_eq!((maps.views[0].width, maps.views[0].height, maps.pairs.len()), (32, 16, 1));
     assert!(maps.cameras.is_empty() && maps.confidence_floor == Some(3.0));
@@ -355,7 +351,7 @@ fn a_pair_network_is_asked_in_both_orders_and_its_layout_and_activation_follow_t
 /// MASt3R as a matcher: pixels of one colour have one descriptor, and every colour occurs once in
 /// each photo.
 #[test]
-fn descriptors_of_a_pair_network_match_photos() {
+fn pair_network_descriptors_match_photos() {
     let (w, h) = (32u64, 16);
     let pixels = (w * h) as usize;
     let mut graph = Onnx::new().input("img1", FLOAT, "1 3 16 32").input("img2", FLOAT, "1 3 16 32");
@@ -375,8 +371,8 @@ fn descriptors_of_a_pair_network_match_photos() {
     let registry = Registry::of(&[dir.path()]);
     let model = registry.installed(Task::Matcher, "mast3r").unwrap();
     assert_eq!(model.tasks, [Task::Geometry, Task::Depth, Task::Matcher]);
-    // A direction on a cone per pixel: no two pixels share one, neighbours are near each other. The
-    // second photo is the first moved by eight pixels.
+    // Each pixel has its own direction on a cone, close to that of its neighbours. The second photo
+    // is the first moved by eight pixels.
     let colours = |shift: usize| {
         let colour = |x: usize, y: usize| {
             let (sin, cos) = (0.1 * x as f32).sin_cos();
@@ -397,9 +393,10 @@ fn descriptors_of_a_pair_network_match_photos() {
     assert!((u - 18.5).abs() < 0.6, "{u}");
 }
 
-/// A matcher that moves everything a quarter of the width to the right, sure as a logit of 2.
+/// A matcher that moves everything a quarter of the width to the right, with a certainty logit of
+/// 2.
 #[test]
-fn a_warp_is_brought_to_the_photos_pixels() {
+fn warps_use_photo_pixels() {
     let mut flow = Vec::new();
     for y in 0..8 {
         for x in 0..8 {
@@ -431,7 +428,7 @@ fn a_warp_is_brought_to_the_photos_pixels() {
     assert!((u - 101.0).abs() < 1e-3 && (v - 26.25).abs() < 1e-3, "{u} {v}");
     assert!((there.certainty.data[p] - 1.0 / (1.0 + (-2f32).exp())).abs() < 1e-6);
     assert_eq!(there.certainty.data[10 * 80 + 78], 0.0, "what leaves the photo has no match");
-    // Without the adapter's sigmoid a logit is no probability.
+    // Without the adapter's sigmoid a logit is refused.
     let raw = "family = \"other\"\n[[graph]]\npart = \"warp\"\nnames = { image1 = \"im_A\", image2 = \"im_B\", warp12 = \
                \"warp_AB\", certainty12 = \"certainty\" }\nimage = { mean = [0.0, 0.0, 0.0], std = [1.0, 1.0, 1.0], size = 56, \
                fit = \"squash\" }";

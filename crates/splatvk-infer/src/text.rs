@@ -24,7 +24,7 @@ impl TextEncoder {
         let failed =
             |e: tokenizers::Error| Error::missing_model(file.display(), format!("{}: {e}", file.display()));
         let mut tokenizer = Tokenizer::from_file(&file).map_err(failed)?;
-        // The file pads every text to 128 tokens; padding would only cost time here.
+        // The file pads every text to 128 tokens, which would only cost time here.
         tokenizer.with_padding(None);
         Ok(TextEncoder { session: registry.session(PackFileKind::Text)?, tokenizer })
     }
@@ -43,8 +43,8 @@ impl TextEncoder {
     }
 
     /// Unit embeddings [N, 384]. The int8 network scales its activations over a whole batch, so an
-    /// embedding differs in the third digit from what [`TextEncoder::embed`] gives: fine for a
-    /// fixed list, wrong for a single query.
+    /// embedding differs in the third digit from that of [`TextEncoder::embed`]: acceptable for a
+    /// fixed list, not for a single query.
     pub fn embed_list(&mut self, texts: &[&str], progress: &dyn Progress) -> Result<Vec<f32>> {
         let tokens = texts.iter().map(|t| self.tokens(t)).collect::<Result<Vec<_>>>()?;
         let mut order: Vec<usize> = (0..texts.len()).collect();
@@ -110,7 +110,7 @@ mod tests {
     }
 
     #[test]
-    fn token_ids_match_the_published_vocabulary() {
+    fn tokens_match_published_vocabulary() {
         let net = encoder();
         // Ids looked up by hand in the uncased BERT vocabulary (line number in vocab.txt less one).
         for (text, ids) in [
@@ -126,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn embeddings_put_related_words_together() {
+    fn embed_relates_similar_words() {
         let mut net = encoder();
         let mut embed = |t: &str| net.embed(t).unwrap();
         let (mug, cup, dog) = (embed("coffee mug"), embed("a cup of coffee"), embed("a dog running"));
@@ -137,7 +137,7 @@ mod tests {
     }
 
     #[test]
-    fn a_list_embeds_almost_as_its_texts_do() {
+    fn embed_list_approximates_embed() {
         let mut net = encoder();
         let texts = ["lemon", "coffee mug", "box of cereal", "plate", "water jug"];
         let list = net.embed_list(&texts, &crate::progress::Silent).unwrap();

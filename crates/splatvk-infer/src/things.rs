@@ -1,20 +1,18 @@
-//! Things of everyday life: what a text could have said instead. `query::presence` of splatvk
-//! weighs a text against them.
+//! Names of everyday things, to which `query::presence` of splatvk compares a text.
 use super::colour;
 
 /// One per line.
 const THINGS: &str = include_str!("things.txt");
 
-/// With words before them so many fewer are asked for: each form is a list of its own, which takes
-/// a text model seconds.
+/// Step through the list for a form with colours: each form is a list of its own, which takes a
+/// text model seconds.
 const FORMED_EVERY: usize = 4;
 
-/// Most colours of a form. A list is made for each form that is asked for, so that their number
-/// bounds the work and the memory.
+/// Largest number of colours in a form. Each form has its own list, so this limits work and memory.
 const MOST_COLOURS: usize = 3;
 
-/// The words that a text must have in common with what else it could have said: its first colours,
-/// each once. Anything red is a little of a "red book".
+/// Form of a text: its first colours, each once. Other things are compared in the same form, since
+/// anything red resembles a "red book" a little.
 pub fn form(text: &str) -> String {
     let mut words: Vec<String> = Vec::new();
     for word in colour::words_in(text) {
@@ -25,30 +23,29 @@ pub fn form(text: &str) -> String {
     words.join(" ")
 }
 
-/// Whether many texts have a form, so that it is worth keeping what belongs to it: one colour at
-/// most.
+/// Whether a form has at most one colour, so that its embeddings are worth caching.
 pub fn is_common(form: &str) -> bool {
     forms().any(|known| known == form)
 }
 
-/// A text that names one colour with each of the other ten; nothing for other texts.
+/// A text of one colour with each of the other ten instead; empty for other texts.
 pub fn recoloured(text: &str) -> Vec<String> {
     let words = colour::words_in(text);
     let [word] = &words[..] else { return Vec::new() };
-    let renamed = |other: &str| {
+    let with_colour = |other: &str| {
         let lower = text.to_lowercase();
         let list = lower.split_whitespace().map(|w| if w == word { other } else { w });
         list.collect::<Vec<_>>().join(" ")
     };
-    colour::names_besides(word).map(renamed).collect()
+    colour::names_besides(word).map(with_colour).collect()
 }
 
-/// Every [`form`] of one colour, and none.
+/// Every [`form`] of at most one colour.
 pub fn forms() -> impl Iterator<Item = &'static str> {
     std::iter::once("").chain(colour::names())
 }
 
-/// The things of a form: without words before them all, otherwise some.
+/// Things of a form: all for the empty form, else every fourth one behind the colours.
 pub fn of_form(form: &str) -> Vec<String> {
     match form {
         "" => THINGS.lines().map(str::to_owned).collect(),
@@ -61,7 +58,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn things_are_named_once() {
+    fn things_are_unique() {
         let all = of_form("");
         let mut sorted = all.clone();
         sorted.sort_unstable();
@@ -73,7 +70,7 @@ mod tests {
     }
 
     #[test]
-    fn the_form_of_a_text_is_its_colours() {
+    fn form_lists_colour_words() {
         assert_eq!(form("Red soda can"), "red");
         assert_eq!(form("a blue and white mug"), "blue white");
         assert_eq!(form("redwood"), "");

@@ -1,11 +1,10 @@
 //! Dense matches from networks: for every pixel of one photo its position in another, with a
-//! certainty. RoMa v1 and v2 say so themselves; MASt3R gives descriptors, whose nearest neighbours
-//! do.
+//! certainty. RoMa v1 and v2 give warps; descriptors of MASt3R are matched by nearest neighbours.
 use rayon::prelude::*;
 
 use super::cache::OutputKey;
 use super::contract::Part;
-use super::graph::Graph;
+use super::graph::{Graph, GraphFile};
 use super::installed::Installed;
 use super::prepare::Prepared;
 use super::runtime::Tensor;
@@ -23,39 +22,17 @@ pub fn warps(
     let Ok(file) = model.graph(Part::Warp) else { return by_descriptors(model, photos, progress) };
     let _turn = file.compute.turn();
     let prepared = super::prepare::inputs(file, "image1", photos)?;
-    let both = file.has("warp21") && file.has("certainty21");
+    let both = is_symmetric(file);
     let mut graph: Option<Graph> = None;
-    let mut forward = |i: usize, j: usize| -> Result<Vec<Field>> {
-        let (a, b) = (&prepared[i], &prepared[j]);
-        let values = file.compute.remember(
-            OutputKey::new("warp").model(file)?.values(&a.data).values(&b.data),
-            || {
-                let net = match graph.take() {
-                    Some(net) => net,
-                    None => file.load()?,
-                };
-                let net = graph.insert(net);
-                let mut outputs = net.run(vec![("image1", a.input()), ("image2", b.input())])?;
-                let mut all = Vec::new();
-                let ends = [("warp12", "certainty12"), ("warp21", "certainty21")];
-                for (warp, certainty) in ends.into_iter().take(if both { 2 } else { 1 }) {
-                    let (warp, sure) = (outputs.take(warp)?, outputs.take(certainty)?);
-                    all.extend(field_values(warp, sure, file)?);
-                }
-                Ok(all)
-            },
-        )?;
-        Ok(fields(&values))
-    };
     let count = photos.len();
     progress.begin("match", (count * count.saturating_sub(1) / 2) as u64);
     let mut all = Vec::new();
     for i in 0..count {
         for j in i + 1..count {
             progress.check()?;
-            let mut found = forward(i, j)?;
+            let mut found = forward(file, &mut graph, [&prepared[i], &prepared[j]])?;
             if !both {
-                found.extend(forward(j, i)?);
+                found.extend(forward(file, &mut graph, [&prepared[j], &prepared[i]])?);
             }
             let [there, back] = &found[..] else {
                 return Err(Error::work(format!("{}: gave no warp", file.path.display())));
@@ -69,7 +46,31 @@ pub fn warps(
     Ok(all)
 }
 
-/// Nearest neighbours of a pair network's descriptors, on a grid of [`STEP`] of its pixels.
+/// Whether a graph gives both directions.
+fn is_symmetric(file: &GraphFile) -> bool {
+    file.has("warp21") && file.has("certainty21")
+}
+
+/// Runs the graph, which is loaded if an output is not cached, on two inputs.
+fn forward(file: &GraphFile, graph: &mut Option<Graph>, [a, b]: [&Prepared; 2]) -> Result<Vec<Field>> {
+    let key = OutputKey::new("warp").model(file)?.values(&a.data).values(&b.data);
+    let values = file.compute.remember(key, || {
+        let net = match graph.take() {
+            Some(net) => net,
+            None => file.load()?,
+        };
+        let mut outputs = graph.insert(net).run(vec![("image1", a.input()), ("image2", b.input())])?;
+        let mut all = Vec::new();
+        let directions = [("warp12", "certainty12"), ("warp21", "certainty21")];
+        for (warp, certainty) in directions.into_iter().take(if is_symmetric(file) { 2 } else { 1 }) {
+            all.extend(field_values(outputs.take(warp)?, outputs.take(certainty)?, file)?);
+        }
+        Ok(all)
+    })?;
+    Ok(fields(&values))
+}
+
+/// Warps from nearest neighbours of a pair network's descriptors, every [`STEP`] of its pixels.
 fn by_descriptors(
     model: &Installed,
     photos: &[Photo],
@@ -103,8 +104,7 @@ fn by_descriptors(
     Ok(all)
 }
 
-/// Pitch of the pixels whose nearest neighbours are sought: a search for each would take minutes a
-/// pair on a CPU.
+/// Step between matched pixels: a search for every pixel takes minutes per pair on a CPU.
 const STEP: usize = 4;
 
 /// A warp at the network's resolution: (x, y) in [−1, 1] of the second input, certainty.
@@ -115,7 +115,7 @@ struct Field {
 }
 
 /// [width, height, (x, y, certainty)…]
-fn field_values(warp: Tensor, certainty: Tensor, file: &super::graph::GraphFile) -> Result<Vec<f32>> {
+fn field_values(warp: Tensor, certainty: Tensor, file: &GraphFile) -> Result<Vec<f32>> {
     let [_, height, width, _] = warp.shape[..] else { return Ok(Vec::new()) };
     if certainty.data.len() != width * height {
         return Err(Error::work(format!("{}: warp and certainty differ in size", file.path.display())));
@@ -150,33 +150,29 @@ fn fields(mut values: &[f32]) -> Vec<Field> {
 }
 
 impl Field {
-    /// Where the nearest descriptors lie. What returns elsewhere is no match; that is for the
-    /// caller to see.
+    /// Warp to the nearest descriptors, with certainty 1; the caller tests forward-backward
+    /// consistency.
     fn nearest(from: (&Descriptors, &Prepared), to: (&Descriptors, &Prepared)) -> Field {
         let (width, height) = (from.1.width / STEP, from.1.height / STEP);
         let seed =
             |cell: usize| (cell / width * STEP + STEP / 2) * from.1.width + cell % width * STEP + STEP / 2;
         let seeds: Vec<usize> = (0..width * height).map(seed).collect();
-        // The middle of a cell lies half a pixel before that of its seed, and so does what it sees.
+        // The centre of a cell lies half a pixel before that of its seed, and so does its target.
         let share = |at: usize, of: usize| 2.0 * at as f32 / of as f32 - 1.0;
         let end = |q: usize| [share(q % to.1.width, to.1.width), share(q / to.1.width, to.1.height), 1.0];
         let found = from.0.nearest(&seeds, to.0);
         Field { width, height, data: found.into_iter().map(end).collect() }
     }
 
-    /// Bilinear, with pixel centres at half-integers; positions beyond the border repeat it.
+    /// Interpolates bilinearly, with pixel centres at half-integers and the border repeated.
     fn sample(&self, x: f64, y: f64) -> [f32; 3] {
-        let axis = |v: f64, n: usize| {
-            let v = (v - 0.5).clamp(0.0, (n - 1) as f64);
-            (v as usize, (v as usize + 1).min(n - 1), v.fract() as f32)
-        };
-        let ((x0, x1, fx), (y0, y1, fy)) = (axis(x, self.width), axis(y, self.height));
-        let at = |x: usize, y: usize| self.data[y * self.width + x];
+        let ((x0, x1, fx), (y0, y1, fy)) = (linear_taps(x, self.width), linear_taps(y, self.height));
+        let value = |x: usize, y: usize| self.data[y * self.width + x];
         let mix = |a: [f32; 3], b: [f32; 3], t: f32| [0, 1, 2].map(|k| a[k] + t * (b[k] - a[k]));
-        mix(mix(at(x0, y0), at(x1, y0), fx), mix(at(x0, y1), at(x1, y1), fx), fy)
+        mix(mix(value(x0, y0), value(x1, y0), fx), mix(value(x0, y1), value(x1, y1), fx), fy)
     }
 
-    /// At every pixel of the first photo: where it is in the second.
+    /// Warp from every pixel of the first photo to pixels of the second.
     fn at_working_size(&self, from: (&Photo, &Prepared), to: (&Photo, &Prepared)) -> DenseWarp {
         let (width, height) = (from.0.image.width, from.0.image.height);
         let back = to.1.from_photo.inverse();
@@ -201,4 +197,10 @@ impl Field {
         });
         DenseWarp { target, certainty }
     }
+}
+
+/// The two neighbours of a coordinate among `n` pixels, and the weight of the second.
+fn linear_taps(v: f64, n: usize) -> (usize, usize, f32) {
+    let v = (v - 0.5).clamp(0.0, (n - 1) as f64);
+    (v as usize, (v as usize + 1).min(n - 1), v.fract() as f32)
 }

@@ -8,14 +8,14 @@
 //! | classes, 1000 | `√p` | `√w`, `w = softmax(cosine to each class name / 0.03)` |
 //! | colour, 11 | colour terms of its pixels | colour words in the text |
 //!
-//! The class block is what separates things: a dot product of square roots is a Bhattacharyya
-//! coefficient, and the steep softmax asks for the class that the phrase means instead of all that
-//! are vaguely alike. The meaning block ranks what no class names. Sentence embeddings have the
-//! class names' mean removed, which carries no information.
+//! The class block separates things: a dot product of square roots is a Bhattacharyya coefficient,
+//! and the steep softmax selects the class that the phrase means, not all vaguely similar ones. The
+//! meaning block ranks things that no class names. Sentence embeddings have the mean of the class
+//! names removed, which carries no information.
 //!
-//! A 1397th coordinate, zero for regions, takes up the length that a text leaves: a text that no
-//! class resembles ("object", "stuff": softmax against a constant 0.55) and that says no colour is
-//! nearly orthogonal to every region, as the canonical phrases of the relevancy score should be.
+//! A last coordinate, zero for regions, completes a text to unit length: a text that resembles no
+//! class ("object", "stuff": softmax against a constant 0.55) and names no colour is nearly
+//! orthogonal to every region, as the canonical phrases of the relevancy score should be.
 //!
 //! It covers about a thousand everyday things and eleven colours. CLIP is the full model.
 use super::cache::OutputKey;
@@ -46,10 +46,9 @@ const SOFTNESS: f32 = 0.03;
 /// measured equally good.
 const THRESHOLD: f32 = 0.55;
 
-/// Cosine to the nearest class name, colours apart, from which a text is among the words that are
-/// known. Of a hundred texts that name no thing ("inflation", "Wednesday") five reach it: the level
-/// of a conformal test. So do 65 % of the 860 other names that the classes have, and of the 980
-/// things of everyday life of [`things`].
+/// Cosine to the nearest class name, without colours, from which a text is in the vocabulary. Of a
+/// hundred texts that name no thing ("inflation", "Wednesday") five reach it: the level of a
+/// conformal test. So do 65 % of the classes' 860 other names and of the 980 everyday [`things`].
 const KNOWN: f32 = 0.46;
 
 /// The encoder. Networks are loaded when first needed.
@@ -59,7 +58,7 @@ pub struct RegionWords {
     vocabulary: Option<Vocabulary>,
 }
 
-/// The sentence encoder and what it makes of the class names.
+/// The sentence encoder and its embeddings of the class names.
 struct Vocabulary {
     encoder: TextEncoder,
     /// [384] mean of the class names' embeddings.
@@ -141,14 +140,14 @@ impl RegionEncoder for RegionWords {
         Ok(all)
     }
 
-    fn others(&mut self, form: &str) -> Result<Vec<f32>> {
+    fn embed_other_things(&mut self, form: &str) -> Result<Vec<f32>> {
         let texts = things::of_form(form);
         let registry = self.registry.clone();
         let key = text_key("other-things", &registry).text(&texts.join("\n"));
         let vocabulary = self.vocabulary(&Silent)?;
         let list: Vec<&str> = texts.iter().map(String::as_str).collect();
         let mut embed = || vocabulary.encoder.embed_list(&list, &Silent);
-        // Whoever asks may put any colours into any order, and fill the folder with that.
+        // Other combinations of colours are too many for the cache.
         let meanings = match things::is_common(form) {
             true => registry.compute().remember(key, embed)?,
             false => embed()?,
@@ -162,7 +161,7 @@ impl RegionEncoder for RegionWords {
         Ok(all)
     }
 
-    fn nearest_word(&mut self, text: &str) -> Result<Option<(bool, String)>> {
+    fn find_nearest_word(&mut self, text: &str) -> Result<Option<(bool, String)>> {
         let vocabulary = self.vocabulary(&Silent)?;
         let meaning = vocabulary.encoder.embed(&colour::without(text))?;
         let meaning = vocabulary.centred(meaning);
@@ -170,22 +169,16 @@ impl RegionEncoder for RegionWords {
         Ok(nearest.first().map(|(class, cosine)| (*cosine >= KNOWN, vocabulary.list[*class].clone())))
     }
 
-    /// Class names, with the region's colour before them where that says more: "yellow lemon".
-    fn names(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
+    /// Class names, behind the region's colour where that raises the cosine: "yellow lemon".
+    fn name_regions(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
         let vocabulary = self.vocabulary(&Silent)?;
         let found = nearest(regions, &vocabulary.rows(), DIM, best);
-        let with_colour = |(list, region): (Vec<(usize, f32)>, &[f32])| {
-            let (term, cosine) = colour::nearest_term(&region[COLOUR_AT..REST_AT]);
-            let gain = SHARES[2].sqrt() * cosine;
-            let name = |(i, cosine): (usize, f32)| match vocabulary.list[i].as_str() {
-                name if gain > 0.0 && colour::terms_in(name).is_none() => {
-                    (format!("{term} {name}"), cosine + gain)
-                }
-                name => (name.to_owned(), cosine),
-            };
-            list.into_iter().map(name).collect()
-        };
-        Ok(found.into_iter().zip(regions.chunks_exact(DIM)).map(with_colour).collect())
+        let regions = regions.chunks_exact(DIM);
+        Ok(found
+            .into_iter()
+            .zip(regions)
+            .map(|(list, region)| vocabulary.with_colour(list, region))
+            .collect())
     }
 }
 
@@ -197,14 +190,14 @@ fn fill_text(row: &mut [f32], meaning: &[f32], classes: &[f32]) {
 }
 
 /// Writes a unit block with `share` of the squared length.
-fn fill(row: &mut [f32], at: usize, share: f32, values: impl IntoIterator<Item = f32>) {
-    row[at..].iter_mut().zip(values).for_each(|(r, v)| *r = share.sqrt() * v);
+fn fill(row: &mut [f32], start: usize, share: f32, values: impl IntoIterator<Item = f32>) {
+    row[start..].iter_mut().zip(values).for_each(|(r, v)| *r = share.sqrt() * v);
 }
 
-/// What the models that understand texts are told apart by.
-fn text_key(what: &'static str, registry: &Registry) -> OutputKey {
+/// Cache key of the text models.
+fn text_key(kind: &'static str, registry: &Registry) -> OutputKey {
     let used = registry.status_of(&[PackFileKind::Text, PackFileKind::Tokenizer, PackFileKind::Classes]);
-    used.iter().fold(OutputKey::new(what), |key, file| key.text(&file.sha256))
+    used.iter().fold(OutputKey::new(kind), |key, file| key.text(&file.sha256))
 }
 
 /// Mean distribution over colour terms of each region's pixels; `None` for a region without pixels.
@@ -234,7 +227,7 @@ impl Vocabulary {
             ));
         }
         let mut encoder = TextEncoder::load(registry)?;
-        // Naming a thousand classes takes seconds, which a single query should not pay.
+        // Embedding a thousand names takes seconds, too long for a single query.
         let key = text_key("class-names", registry);
         let mut names = registry.compute().remember(key, || {
             encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>(), progress)
@@ -250,7 +243,20 @@ impl Vocabulary {
         Ok(Vocabulary { encoder, mean, names, list })
     }
 
-    /// A sentence embedding without what all class names share.
+    /// Names of classes (index, cosine), behind the region's colour where that raises the cosine.
+    fn with_colour(&self, list: Vec<(usize, f32)>, region: &[f32]) -> Vec<(String, f32)> {
+        let (term, cosine) = colour::nearest_term(&region[COLOUR_AT..REST_AT]);
+        let gain = SHARES[2].sqrt() * cosine;
+        let name = |(i, cosine): (usize, f32)| match self.list[i].as_str() {
+            name if gain > 0.0 && colour::terms_in(name).is_none() => {
+                (format!("{term} {name}"), cosine + gain)
+            }
+            name => (name.to_owned(), cosine),
+        };
+        list.into_iter().map(name).collect()
+    }
+
+    /// Subtracts the mean of the class names from a sentence embedding and normalises it.
     fn centred(&self, mut meaning: Vec<f32>) -> Vec<f32> {
         meaning.iter_mut().zip(&self.mean).for_each(|(v, m)| *v -= m);
         normalise(&mut meaning);
@@ -309,8 +315,7 @@ mod tests {
         query: &[f32],
         canonical: &[f32],
     ) -> Option<(usize, f32)> {
-        // Less than a thumbnail's worth of pixels is not worth ranking (a sliver of carpet in one
-        // view).
+        // Objects of fewer than 50 pixels are not ranked (a sliver of carpet in one view).
         let visible = |o: i32| view.masks.data.iter().filter(|m| **m == o).count() >= 50;
         let score = |o: i32| relevancy(&regions[o as usize * DIM..(o as usize + 1) * DIM], query, canonical);
         let right = visible(object).then(|| score(object))?;
@@ -318,7 +323,7 @@ mod tests {
         Some((better + 1, right))
     }
 
-    /// How many phrase–view pairs put the right region first, and of how many. Phrases in `sure`
+    /// Number of phrase–view pairs that rank the right region first, and of all. Phrases in `sure`
     /// must.
     fn first_of(words: &mut RegionWords, split: &str, sure: &[&str]) -> (usize, usize) {
         let canonical = words.embed_texts(&["object", "things", "stuff", "texture"]).unwrap();
@@ -342,7 +347,7 @@ mod tests {
     }
 
     #[test]
-    fn phrases_find_their_regions_on_breakfast() {
+    fn phrases_find_breakfast_regions() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let sure = ["lemon", "blue mug", "plate", "red soda can", "loaf of bread", "green book"];
         // Measured 39 of 41 on the views that the shares were chosen on, 73 of 81 on views that
@@ -366,9 +371,9 @@ mod tests {
         balance|symmetry";
 
     #[test]
-    fn words_that_are_not_known_say_so() {
+    fn find_nearest_word_detects_unknown_words() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
-        let mut nearest = |text: &str| words.nearest_word(text).unwrap().unwrap();
+        let mut nearest = |text: &str| words.find_nearest_word(text).unwrap().unwrap();
         let known = NO_THINGS.split('|').filter(|text| nearest(text).0).count();
         assert!(NO_THINGS.split('|').count() == 100 && known <= 5, "{known} of them are known");
         let known = |w: &str| (true, w.to_owned());
@@ -379,7 +384,7 @@ mod tests {
             ("red soda can", known("milk can")),
             ("green book", known("comic book")),
             ("usb cable", (false, "computer keyboard".to_owned())),
-            // The bird "African grey" is not what is grey here.
+            // Not the bird "African grey".
             ("grey photosynthesis", (false, "greenhouse".to_owned())),
         ] {
             assert_eq!(nearest(text), expected, "{text}");
@@ -387,40 +392,40 @@ mod tests {
     }
 
     #[test]
-    fn regions_get_names() {
+    fn name_regions_adds_colours() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let view = &views("train")[1];
         let regions = words.embed_regions(&view.image, &view.masks, 12, &Silent).unwrap();
-        let names = words.names(&regions, 5).unwrap();
+        let names = words.name_regions(&regions, 5).unwrap();
         assert!(names.len() == 12 && names.iter().all(|list| list.len() == 5));
         let object = phrases().into_iter().find(|(_, p)| p == "lemon").map_or(0, |(o, _)| o as usize);
-        // To the classifier it is as much a spaghetti squash.
+        // The classifier gives "spaghetti squash" as much.
         let found = names[object].iter().find(|(name, _)| name == "yellow lemon");
-        // The same text asked for has the same cosine, up to what the batched network rounds away.
+        // The text itself has the same cosine, up to rounding of the batched network.
         let asked = words.embed_texts(&["yellow lemon"]).unwrap();
         let cosine = dot(&asked, &regions[object * DIM..(object + 1) * DIM]);
         assert!(found.is_some_and(|(_, c)| (c - cosine).abs() < 0.05), "{cosine}: {:?}", names[object]);
     }
 
     #[test]
-    fn views_of_one_thing_agree() {
+    fn embed_regions_agrees_across_views() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let views = views("train");
-        let mut of = |v: &TestView| words.embed_regions(&v.image, &v.masks, 12, &Silent).unwrap();
-        let (a, b) = (of(&views[1]), of(&views[2]));
-        let row = |all: &[f32], i: usize| all[i * DIM..(i + 1) * DIM].to_vec();
+        let mut embed = |v: &TestView| words.embed_regions(&v.image, &v.masks, 12, &Silent).unwrap();
+        let (a, b) = (embed(&views[1]), embed(&views[2]));
+        let region = |all: &[f32], i: usize| all[i * DIM..(i + 1) * DIM].to_vec();
         // The eight objects. Measured: the same one 0.8 to 0.98, another 0.38 in the middle and
         // 0.76 at most.
         for i in 4..12 {
-            let same = dot(&row(&a, i), &row(&b, i));
+            let same = dot(&region(&a, i), &region(&b, i));
             let other =
-                (4..12).filter(|j| *j != i).map(|j| dot(&row(&a, i), &row(&b, j))).fold(0.0, f32::max);
+                (4..12).filter(|j| *j != i).map(|j| dot(&region(&a, i), &region(&b, j))).fold(0.0, f32::max);
             assert!(same > 0.7 && same > other, "object {i}: {same} with itself, {other} with another");
         }
     }
 
     #[test]
-    fn embeddings_are_unit_vectors_and_empty_regions_zero() {
+    fn embeddings_are_unit_or_zero() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let view = &views("train")[0];
         let regions = words.embed_regions(&view.image, &view.masks, 14, &Silent).unwrap();

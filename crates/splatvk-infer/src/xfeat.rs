@@ -10,7 +10,7 @@ use crate::{Error, Result};
 pub const DIM: usize = 64;
 /// Side of the square of pixels that one cell of the network's maps covers.
 const CELL: usize = 8;
-/// The network halves the image five times.
+/// Input sides are multiples of this: the network halves the image five times.
 const MULTIPLE: usize = 32;
 /// Least keypoint probability, as published with the weights.
 const THRESHOLD: f32 = 0.05;
@@ -49,17 +49,18 @@ impl XFeatKeypoints {
 
 /// For each row of `a` [N, 64] the row of `b` [M, 64] with the largest dot product.
 fn best_matches(a: &[f32], b: &[f32]) -> Vec<Option<(usize, f32)>> {
-    let best = |x: &[f32]| {
-        let mut found: Option<(usize, f32)> = None;
-        for (j, y) in b.chunks_exact(DIM).enumerate() {
-            let dot = x.iter().zip(y).map(|(p, q)| p * q).sum::<f32>();
-            if found.is_none_or(|(_, most)| dot > most) {
-                found = Some((j, dot));
-            }
+    a.par_chunks_exact(DIM).map(|x| best_match(x, b)).collect()
+}
+
+fn best_match(x: &[f32], b: &[f32]) -> Option<(usize, f32)> {
+    let mut best: Option<(usize, f32)> = None;
+    for (j, y) in b.chunks_exact(DIM).enumerate() {
+        let dot = x.iter().zip(y).map(|(p, q)| p * q).sum::<f32>();
+        if best.is_none_or(|(_, most)| dot > most) {
+            best = Some((j, dot));
         }
-        found
-    };
-    a.par_chunks_exact(DIM).map(best).collect()
+    }
+    best
 }
 
 /// Descriptors of every 8×8 cell.
@@ -232,16 +233,16 @@ fn heatmap(logits: &[f32], cw: usize, ch: usize) -> Image<f32> {
     heat
 }
 
-/// Pixels above the threshold that no pixel of their 5×5 window exceeds.
+/// Pixels above the threshold that are the maximum of their 5×5 window.
 fn local_maxima(heat: &Image<f32>) -> Vec<(usize, usize)> {
     let rows = (0..heat.height).into_par_iter().flat_map_iter(|y| {
         (0..heat.width).filter_map(move |x| {
             let value = heat.at(x, y);
-            let highest = || {
+            let is_highest = || {
                 (y.saturating_sub(2)..(y + 3).min(heat.height))
                     .all(|j| (x.saturating_sub(2)..(x + 3).min(heat.width)).all(|i| heat.at(i, j) <= value))
             };
-            (value > THRESHOLD && highest()).then_some((x, y))
+            (value > THRESHOLD && is_highest()).then_some((x, y))
         })
     });
     rows.collect()
@@ -250,15 +251,20 @@ fn local_maxima(heat: &Image<f32>) -> Vec<(usize, usize)> {
 /// Sub-pixel position of a peak relative to its pixel: a parabola per axis through the logarithms.
 fn peak_offset(heat: &Image<f32>, x: usize, y: usize) -> [f32; 2] {
     let log = |x: usize, y: usize| heat.at(x, y).max(1e-8).ln();
-    let fit = |before: f32, at: f32, after: f32| {
-        let curvature = before - 2.0 * at + after;
-        if curvature < -1e-6 { (0.5 * (before - after) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
-    };
     let inside = x > 0 && y > 0 && x + 1 < heat.width && y + 1 < heat.height;
     if !inside {
         return [0.0, 0.0];
     }
-    [fit(log(x - 1, y), log(x, y), log(x + 1, y)), fit(log(x, y - 1), log(x, y), log(x, y + 1))]
+    [
+        parabola_peak(log(x - 1, y), log(x, y), log(x + 1, y)),
+        parabola_peak(log(x, y - 1), log(x, y), log(x, y + 1)),
+    ]
+}
+
+/// Offset of the maximum of the parabola through three values, at most half a pixel.
+fn parabola_peak(before: f32, at: f32, after: f32) -> f32 {
+    let curvature = before - 2.0 * at + after;
+    if curvature < -1e-6 { (0.5 * (before - after) / curvature).clamp(-0.5, 0.5) } else { 0.0 }
 }
 
 #[cfg(test)]
@@ -267,10 +273,10 @@ mod tests {
     use glam::DVec2;
     use splatvk_test_support::breakfast::{TestView, train_views};
 
-    /// Distance in pixels between each match and where the exact depth and cameras put it; hidden
-    /// points are left out.
+    /// Distance in pixels of each match from its position by exact depth and cameras, without
+    /// occluded points.
     fn errors(a: &TestView, b: &TestView, fa: &XFeatKeypoints, fb: &XFeatKeypoints) -> Vec<f64> {
-        let one = |(i, j, _): (usize, usize, f32)| {
+        let error = |(i, j, _): (usize, usize, f32)| {
             let [u, v] = fa.keypoints[i];
             let depth = a.depth.at(u as usize, v as usize) as f64;
             let world = a.camera.unproject(DVec2::new(u as f64, v as f64), depth);
@@ -282,11 +288,11 @@ mod tests {
             let [x, y] = fb.keypoints[j];
             seen.then(|| p.distance(DVec2::new(x as f64, y as f64)))
         };
-        fa.mutual_matches(fb, 0.82).into_iter().filter_map(one).collect()
+        fa.mutual_matches(fb, 0.82).into_iter().filter_map(error).collect()
     }
 
     #[test]
-    fn matches_between_views_agree_with_the_exact_geometry() {
+    fn matches_agree_with_exact_depth() {
         let views = train_views();
         let mut net = XFeat::load(&Registry::open(None).unwrap()).unwrap();
         let features: Vec<_> = views.iter().map(|v| net.detect(&v.image, 4096).unwrap()).collect();

@@ -1,13 +1,13 @@
-//! Masks with features → aligned things → codebooks and training targets.
+//! From masks with features to components, codebooks and training targets.
 use super::ViewMasks;
-use super::align::{self, AlignOptions, Alignment, PairLinks, links_from_depth};
+use super::align::{self, AlignOptions, Alignment, Component, PairLinks, links_from_depth};
 use super::codebook::{self, CodeEntry, EncodedLevel, autoencoder, quantise};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, Image, LanguageField, LevelField};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// How embeddings become the short codes that splats carry.
+/// Method that reduces embeddings to the codes of splats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -16,20 +16,20 @@ pub enum Reducer {
     Bijection,
     /// A scene autoencoder to three dimensions and back, as LangSplat; `feature_dim` is then 3.
     Autoencoder {
-        /// Train for at least so many steps; the published 100 epochs are few of them for the
-        /// features of a few photos.
+        /// Smallest number of training steps; with the features of a few photos, the published 100
+        /// epochs are few steps.
         least_steps: usize,
     },
-    /// At most 128 mean features, as LEGaussians; codes are a start for an index head.
+    /// At most 128 mean features, as LEGaussians; codes initialise an index head.
     Quantised,
 }
 
-/// How the language field is built.
+/// Options of [`build`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct BuildOptions {
     /// Alignment thresholds.
     pub align: AlignOptions,
-    /// From embeddings to codes.
+    /// Reduction of embeddings to codes.
     pub reducer: Reducer,
     /// d, the length of the codes that splats carry.
     pub feature_dim: usize,
@@ -53,7 +53,7 @@ impl Default for BuildOptions {
     }
 }
 
-/// What [`build`] produces.
+/// Result of [`build`].
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct Language {
@@ -124,12 +124,12 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
         (0..alignment.components.len()).map(|l| entries(alignment, l)).collect();
     let built = match options.reducer {
         Reducer::Bijection => {
-            let one = |e: &Vec<CodeEntry>| codebook::build(e, options.feature_dim, options.seed);
-            entries.iter().map(one).collect::<Result<Vec<EncodedLevel>>>()?
+            let encode = |e: &Vec<CodeEntry>| codebook::build(e, options.feature_dim, options.seed);
+            entries.iter().map(encode).collect::<Result<Vec<EncodedLevel>>>()?
         }
         Reducer::Quantised => {
-            let one = |e: &Vec<CodeEntry>| quantise::build(e, options.feature_dim, options.seed);
-            entries.iter().map(one).collect()
+            let encode = |e: &Vec<CodeEntry>| quantise::build(e, options.feature_dim, options.seed);
+            entries.iter().map(encode).collect()
         }
         Reducer::Autoencoder { least_steps } => {
             autoencoder::build(&entries, least_steps, options.seed, progress)?.0
@@ -160,15 +160,19 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
 
 /// Embedding, weight and members of every component of a level.
 fn entries(alignment: &Alignment, level: usize) -> Vec<CodeEntry> {
-    let entry = |c: &align::Component| {
-        let masks = &alignment.views[c.medoid.view as usize].levels[level];
-        let dim = masks.features.len() / masks.quality.len().max(1);
-        let at = c.medoid.mask as usize * dim;
-        CodeEntry {
-            embedding: masks.features[at..at + dim].to_vec(),
-            weight: c.weight,
-            members: c.members.clone(),
-        }
-    };
-    alignment.components[level].iter().map(entry).collect()
+    let components = alignment.components[level].iter();
+    let entries = components.map(|c| CodeEntry {
+        embedding: medoid_feature(alignment, level, c).to_vec(),
+        weight: c.weight,
+        members: c.members.clone(),
+    });
+    entries.collect()
+}
+
+/// Feature of a component's medoid, [D].
+pub(super) fn medoid_feature<'a>(alignment: &'a Alignment, level: usize, c: &Component) -> &'a [f32] {
+    let masks = &alignment.views[c.medoid.view as usize].levels[level];
+    let dim = masks.features.len() / masks.quality.len().max(1);
+    let start = c.medoid.mask as usize * dim;
+    &masks.features[start..start + dim]
 }

@@ -49,21 +49,21 @@ pub fn read_view(dir: &Path, photo: &Photo, with_features: bool) -> Result<ViewM
     Ok(out)
 }
 
-/// Reads the photos of a folder one after the other: features of all have one length.
+/// Reads the masks of a folder photo by photo and checks that all features have one length.
 pub struct DirMasks<'a> {
     dir: &'a Path,
     with_features: bool,
-    /// The first length and the photo that has it.
+    /// Length of the first features, and the stem of their photo.
     first: Option<(usize, String)>,
 }
 
 impl<'a> DirMasks<'a> {
-    /// Nothing is read yet.
+    /// Creates a reader; no file is read yet.
     pub fn new(dir: &'a Path, with_features: bool) -> Self {
         DirMasks { dir, with_features, first: None }
     }
 
-    /// [`read_view`] of the next photo; refuses features of another length than the others'.
+    /// Reads the next photo ([`read_view`]); features of another length are an error.
     pub fn read(&mut self, photo: &Photo) -> Result<ViewMasks> {
         let view = read_view(self.dir, photo, self.with_features)?;
         let found = view.levels.iter().find_map(|l| l.features.len().checked_div(l.quality.len()));
@@ -143,8 +143,8 @@ pub fn normalise_rows(rows: &mut [f32], dim: usize) {
     }
 }
 
-/// Labels of the original or the working size as the photo's image shows them: nearest pixels,
-/// through the photo's affine map and the lens that was taken out.
+/// Resamples labels of the original or the working size to the photo's image: nearest pixels,
+/// through the photo's affine map and the removed distortion.
 fn to_working(labels: Image<i32>, photo: &Photo) -> Image<i32> {
     let (width, height) = (photo.image.width, photo.image.height);
     let same = (labels.width, labels.height) == (width, height);
@@ -201,7 +201,7 @@ fn compact(labels: Image<i32>, features: Option<&FeatureRows>, path: &Path) -> R
     Ok(out)
 }
 
-/// Phrase → unit vector, as `text_embeddings.npz` stores it.
+/// Unit vectors of phrases, read from `text_embeddings.npz`.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TextEmbeddings {
     /// D.
@@ -251,7 +251,7 @@ impl TextEmbeddings {
     pub fn iter(&self) -> impl Iterator<Item = (&str, &[f32])> {
         self.entries.iter().map(|(phrase, vector)| (phrase.as_str(), vector.as_slice()))
     }
-    /// [texts.len(), D] unit rows; an unknown phrase is an error that lists what is known.
+    /// [texts.len(), D] unit rows; an unknown phrase is an error that lists known ones.
     pub fn embed(&self, texts: &[&str]) -> Result<Vec<f32>> {
         let mut out = Vec::with_capacity(texts.len() * self.dim);
         for text in texts {
@@ -289,8 +289,8 @@ mod tests {
         }
     }
 
-    /// Left half row 2, right half row 5 at every level of a 4-map file, plus one lone pixel of row
-    /// 1; nothing in its first map, which is no level.
+    /// Left half row 2, right half row 5 at every level of a 4-map file, plus one pixel of row 1;
+    /// its first map, which is not a level, is empty.
     fn write_case(dir: &Path, width: usize, height: usize) {
         let mut labels = Vec::new();
         for map in 0..4 {
@@ -310,7 +310,7 @@ mod tests {
     }
 
     #[test]
-    fn labels_follow_a_lens_that_was_taken_out() {
+    fn labels_follow_removed_distortion() {
         let mut seen = photo(200, 100, (200, 100));
         let lens = crate::scene::Lens::radial(-0.3, 0.0);
         seen.straightened = Some(crate::photo::Straightening {
@@ -321,13 +321,13 @@ mod tests {
         });
         let columns = (0..200 * 100).map(|k| k % 200).collect();
         let labels = to_working(Image { width: 200, height: 100, data: columns }, &seen);
-        // r = 0.6 is imaged at 0.6 (1 − 0.3 · 0.36) = 0.5352, 80.28 pixels from the middle instead
+        // r = 0.6 is imaged at 0.6 (1 − 0.3 · 0.36) = 0.5352, 80.28 pixels from the centre instead
         // of 90.
         assert_eq!((labels.at(190, 50), labels.at(100, 50)), (180, 100));
     }
 
     #[test]
-    fn reads_compacts_and_normalises() {
+    fn read_view_compacts_and_normalises() {
         let dir = tempfile::tempdir().unwrap();
         write_case(dir.path(), 16, 10);
         let view = read_view(dir.path(), &photo(16, 10, (16, 10)), true).unwrap();
@@ -346,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn features_of_all_photos_have_one_length_and_finite_numbers() {
+    fn read_refuses_mixed_lengths_and_nan() {
         let dir = tempfile::tempdir().unwrap();
         write_case(dir.path(), 16, 10);
         for kind in ["s", "f"] {
@@ -354,13 +354,13 @@ mod tests {
                 .unwrap();
         }
         let other = Photo { stem: "b".into(), ..photo(16, 10, (16, 10)) };
-        let both = || {
+        let read_both = || {
             let mut masks = DirMasks::new(dir.path(), true);
             masks.read(&photo(16, 10, (16, 10))).and_then(|_| masks.read(&other)).map_err(|e| e.to_string())
         };
-        assert!(both().is_ok());
+        assert!(read_both().is_ok());
         npy::write(dir.path().join("b_f.npy"), &NpyArray::f32(&[6, 4], vec![1.0; 24])).unwrap();
-        let e = both().unwrap_err();
+        let e = read_both().unwrap_err();
         assert!(e.contains("b_f.npy: features of length 4, those of a_f.npy have 3"), "{e}");
         let table = dir.path().join("text_embeddings.npz");
         npy::write_npz(&table, &[("mug", &NpyArray::f32(&[2], vec![1.0, f32::NAN]))]).unwrap();
@@ -368,7 +368,7 @@ mod tests {
     }
 
     #[test]
-    fn errors_name_the_file_and_the_reason() {
+    fn read_view_errors_state_reason() {
         let dir = tempfile::tempdir().unwrap();
         let message = |p: &Photo, f: bool| read_view(dir.path(), p, f).unwrap_err().to_string();
         assert!(message(&photo(8, 8, (8, 8)), true).contains("a_s.npy: missing"));
@@ -386,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn text_embeddings_are_found_whatever_the_case() {
+    fn text_embeddings_ignore_case() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("text_embeddings.npz");
         assert!(TextEmbeddings::read(&path).unwrap_err().to_string().contains("missing"));

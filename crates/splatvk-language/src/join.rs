@@ -1,11 +1,10 @@
-//! Masks of photos that join a scene, under the codes that it has
+//! Maps masks of new photos to the codes of an existing scene
 //! (docs/internals/method.md#photos-added-later).
 //!
-//! A scene seen from the camera of a new photo shows its things where the photo shows them: the
-//! same alignment that joins masks of two photos joins the photo's masks with the codes that are
-//! rendered there.
+//! Codes are rendered from the camera of a new photo. The alignment that joins masks of two photos
+//! then joins the photo's masks with the rendered codes.
 use super::align::{self, Alignment, Component, PairLinks, links_from_depth, links_from_overlay};
-use super::build::{BuildOptions, Language};
+use super::build::{BuildOptions, Language, medoid_feature};
 use super::codebook::{self, CodeEntry};
 use super::{LevelMasks, ViewMasks};
 use crate::progress::Progress;
@@ -13,49 +12,48 @@ use crate::scene::{Camera, DepthMap, Image, LanguageField, LevelField, MaskId};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 
-/// Relative difference in depth that two views of one surface may have, as in the other alignment
-/// steps (docs/internals/method.md#reprojection).
+/// Tolerance of the relative depth difference between two views of one surface, as in the alignment
+/// (docs/internals/method.md#reprojection).
 const SAME_SURFACE: f32 = 0.05;
 
-/// Share of a mask that stands on surfaces the scene does not have, from which on a mask that is
-/// none of its things is a new one. Below, the scene has an answer for most of it already, which a
-/// second one would only contradict.
+/// Share of pixels without a surface or code of the scene from which an unmatched component is a
+/// new thing. Below it, a second code would contradict the scene's answer for most of the pixels.
 const MOSTLY_NEW: f64 = 0.5;
 
-/// A scene from the camera of a new photo, and what was measured in that photo.
+/// Rendering of a scene from the camera of a new photo, and the depth measured in the photo.
 pub struct SceneView<'a> {
-    /// Its camera.
+    /// Camera of the photo.
     pub camera: Camera,
-    /// Per level the codes that the scene shows, −1 = none.
+    /// Per level the rendered codes, −1 = none.
     pub codes: Vec<Image<i32>>,
-    /// As the scene renders it, world units; 0 = nothing.
+    /// Rendered depth, world units; 0 = nothing.
     pub depth: Image<f32>,
-    /// As it was measured in the photo.
+    /// Depth measured in the photo.
     pub measured: &'a DepthMap,
 }
 
 impl SceneView<'_> {
-    /// Pixels in which the photo shows a surface of the scene.
-    fn same(&self) -> Vec<bool> {
-        let both = self.depth.data.iter().zip(&self.measured.depth.data);
-        both.map(|(r, m)| *r > 0.0 && *m > 0.0 && (r / m - 1.0).abs() < SAME_SURFACE).collect()
+    /// Whether each pixel of the photo shows a surface of the scene.
+    fn shared_surface(&self) -> Vec<bool> {
+        let depths = self.depth.data.iter().zip(&self.measured.depth.data);
+        depths.map(|(r, m)| *r > 0.0 && *m > 0.0 && (r / m - 1.0).abs() < SAME_SURFACE).collect()
     }
 
-    /// The scene as if its codes were masks of a photo, each with the embedding of its code.
+    /// The rendered codes as masks, each with the embedding of its code.
     fn masks(&self, field: &LanguageField) -> ViewMasks {
-        let level = |(labels, level): (&Image<i32>, &LevelField)| LevelMasks {
+        let levels = self.codes.iter().zip(&field.levels).map(|(labels, level)| LevelMasks {
             labels: labels.clone(),
             quality: vec![1.0; level.codebook.len()],
             features: level.codebook.embeddings.clone(),
             ..LevelMasks::default()
-        };
-        ViewMasks { levels: self.codes.iter().zip(&field.levels).map(level).collect() }
+        });
+        ViewMasks { levels: levels.collect() }
     }
 }
 
-/// The field of a scene that `masks` of new photos join, one entry per view of `new`. `known` are
-/// the codes of the scene's own photos: they stay, and so does every code. Splat features are empty
-/// until training fills them.
+/// Extends the field of a scene by new photos; `masks` has one entry per view of `new`. `known`
+/// holds the codes of the scene's own photos. These and all existing codes stay unchanged. Splat
+/// features are empty until training fills them.
 pub fn join(
     field: &LanguageField,
     known: Vec<Vec<Image<i32>>>,
@@ -69,7 +67,7 @@ pub fn join(
         return Err(Error::work(format!("language: masks of {} photos for {n} new ones", masks.len())));
     }
     progress.begin("align", 2);
-    let same: Vec<Vec<bool>> = new.iter().map(SceneView::same).collect();
+    let same: Vec<Vec<bool>> = new.iter().map(SceneView::shared_surface).collect();
     let mut views: Vec<ViewMasks> = new.iter().map(|v| v.masks(field)).collect();
     views.extend_from_slice(masks);
     let overlay: Vec<PairLinks> = (0..n).map(|k| links_from_overlay(k, n + k, &same[k])).collect();
@@ -95,8 +93,8 @@ pub fn join(
     Ok(Language { field: out, alignment })
 }
 
-/// One level of a joint alignment: views below `new.len()` are the scene's, the others those of the
-/// photos.
+/// One level of a joint alignment: views below `new.len()` are renderings of the scene, the others
+/// are the photos.
 struct Level<'a> {
     level: usize,
     field: &'a LevelField,
@@ -110,7 +108,7 @@ impl Level<'_> {
         &self.alignment.views[view].levels[self.level].labels
     }
 
-    /// The codebook with what is new, and per new photo the code of every pixel.
+    /// Returns the extended codebook, and per new photo the code of every pixel.
     fn join(
         &self,
         known: usize,
@@ -122,7 +120,7 @@ impl Level<'_> {
         let mut entry_of: Vec<Option<usize>> = Vec::new();
         let mut old_of: Vec<Option<u32>> = Vec::new();
         for component in components {
-            let code = self.code(component);
+            let code = self.existing_code(component);
             old_of.push(code);
             let is_new = code.is_none() && self.new_share(component) >= MOSTLY_NEW;
             entry_of.push(is_new.then_some(entries.len()));
@@ -133,13 +131,13 @@ impl Level<'_> {
         let joined = codebook::append(&self.field.codebook, &entries, options.feature_dim, options.seed)?;
         let mut codebook = joined.codebook;
         let mut targets: Vec<Image<i32>> = (0..n).map(|k| self.labels(n + k).clone()).collect();
-        // Per photo and mask: its code, and the mask of the scene that it is.
+        // Per mask of a photo: its code, and the rendered mask of its view that it is joined with.
         let mut of_mask: BTreeMap<MaskId, (i32, Option<u32>)> = BTreeMap::new();
         for ((component, old), entry) in components.iter().zip(&old_of).zip(&entry_of) {
             let code = old.or(entry.map(|e| joined.code_of[e])).map_or(-1, |c| c as i32);
             for member in component.members.iter().filter(|m| m.view as usize >= n) {
-                let twin = component.members.iter().find(|m| m.view as usize + n == member.view as usize);
-                of_mask.insert(*member, (code, twin.map(|m| m.mask)));
+                let rendered = component.members.iter().find(|m| m.view as usize + n == member.view as usize);
+                of_mask.insert(*member, (code, rendered.map(|m| m.mask)));
                 if let Some(old) = old {
                     let global = MaskId { view: member.view - n as u32 + known as u32, mask: member.mask };
                     codebook.members[*old as usize].push(global);
@@ -149,21 +147,21 @@ impl Level<'_> {
         for (k, target) in targets.iter_mut().enumerate() {
             let (codes, scene) = (&self.new[k].codes[self.level], self.labels(k));
             for (p, label) in target.data.iter_mut().enumerate().filter(|(_, l)| **l >= 0) {
-                let own = of_mask.get(&MaskId::new(n + k, *label as usize));
-                let (code, twin) = own.copied().unwrap_or((-1, None));
+                let joined = of_mask.get(&MaskId::new(n + k, *label as usize));
+                let (code, rendered) = joined.copied().unwrap_or((-1, None));
                 let shown = if self.same[k][p] { codes.data[p] } else { -1 };
-                // Several things of the scene that the photo shows as one stay several where
-                // alignment has fused them, which it does not on the finest level; what matched
-                // nothing stays what it was.
-                let stays = shown >= 0 && (code < 0 || twin.is_some_and(|t| t as i32 == scene.data[p]));
+                // Rendered codes that alignment fused under one mask of the photo stay separate
+                // (there is no fusion on the finest level). Unmatched masks keep the rendered
+                // codes.
+                let stays = shown >= 0 && (code < 0 || rendered.is_some_and(|r| r as i32 == scene.data[p]));
                 *label = if stays { shown } else { code };
             }
         }
         Ok((codebook, targets))
     }
 
-    /// The code of the scene that a component is: of several, the one with most pixels.
-    fn code(&self, component: &Component) -> Option<u32> {
+    /// Existing code of a component: of several, the one with the most pixels.
+    fn existing_code(&self, component: &Component) -> Option<u32> {
         let mut pixels: BTreeMap<u32, usize> = BTreeMap::new();
         for m in component.members.iter().filter(|m| (m.view as usize) < self.new.len()) {
             let labels = &self.labels(m.view as usize).data;
@@ -175,7 +173,7 @@ impl Level<'_> {
             .map(|(code, _)| code)
     }
 
-    /// Share of the pixels of a component of new masks that the scene has nothing for.
+    /// Share of a component's photo pixels that show no surface or no code of the scene.
     fn new_share(&self, component: &Component) -> f64 {
         let n = self.new.len();
         let (mut fresh, mut all) = (0usize, 0usize);
@@ -192,12 +190,9 @@ impl Level<'_> {
 
     fn entry(&self, component: &Component, known: usize) -> CodeEntry {
         let n = self.new.len() as u32;
-        let masks = &self.alignment.views[component.medoid.view as usize].levels[self.level];
-        let dim = masks.features.len() / masks.quality.len().max(1);
-        let at = component.medoid.mask as usize * dim;
         let global = |m: &MaskId| MaskId { view: m.view - n + known as u32, mask: m.mask };
         CodeEntry {
-            embedding: masks.features[at..at + dim].to_vec(),
+            embedding: medoid_feature(self.alignment, self.level, component).to_vec(),
             weight: component.weight,
             members: component.members.iter().filter(|m| m.view >= n).map(global).collect(),
         }
@@ -221,7 +216,7 @@ mod tests {
         std::array::from_fn(|i| if i == k { 1.0 } else { 0.0 })
     }
 
-    /// Two things of axes 0 and 1, left and right of column 12, on every level.
+    /// Two things of axes 0 and 1 on every level.
     fn field() -> LanguageField {
         let codebook = Codebook {
             embedding_dim: 4,
@@ -250,8 +245,9 @@ mod tests {
     }
 
     #[test]
-    fn known_things_keep_their_codes_and_only_new_ones_get_one() {
-        // The scene shows its two things up to column 24 and nothing beyond.
+    fn join_adds_codes_for_new_things() {
+        // The rendering shows two things, left and right of column 12, and nothing from column 24
+        // on.
         let code = |x: usize| {
             if x < 12 {
                 0
@@ -264,8 +260,8 @@ mod tests {
         let codes = vec![plane(|x, _| code(x)); 3];
         let measured = DepthMap { depth: plane(|_, _| 2.0), confidence: plane(|_, _| 0.9) };
         let depth = plane(|x, _| if x < 24 { 2.0 } else { 0.0 });
-        // The photo: mask 0 is the left thing, 1 the right one, 2 something new beyond; 3 is a spot
-        // within the left thing that resembles nothing there.
+        // Masks of the photo: 0 the left thing, 1 the right one, 2 a new thing beyond, 3 a spot
+        // within the left thing with another feature.
         let mask = |x: usize, y: usize| match x {
             0..4 if y < 8 => 3,
             0..12 => 0,
@@ -299,9 +295,9 @@ mod tests {
     }
 
     #[test]
-    fn things_that_a_scene_tells_apart_stay_apart_under_one_mask_of_the_photo() {
+    fn join_keeps_codes_under_merged_mask() {
         let mut old = field();
-        // Alike enough to be parts of one thing.
+        // Similar enough for fusion.
         let alike = [0.8, 0.6, 0.0, 0.0];
         old.levels.iter_mut().for_each(|l| l.codebook.embeddings[4..].copy_from_slice(&alike));
         let code = |x: usize| i32::from(x >= 12);

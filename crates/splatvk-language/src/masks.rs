@@ -12,13 +12,13 @@ pub struct LevelMasks {
     pub quality: Vec<f32>,
     /// [M, D] unit feature per mask, row-major; empty until region features ran.
     pub features: Vec<f32>,
-    /// Label maps with every mask as it was found, in one of them, so that masks which overlap are
-    /// in different ones; empty where `labels` has them whole, and once features are there.
+    /// Label maps of the complete masks; overlapping masks are in different maps. Empty if `labels`
+    /// shows every mask complete, and after features are computed.
     pub whole: Vec<Image<i32>>,
 }
 
 impl LevelMasks {
-    /// Leaves the pixels for which `keep(index)` holds; masks without any pixel left go.
+    /// Keeps the pixels for which `keep(index)` is true and removes masks that have no pixels then.
     pub fn keep(&mut self, keep: impl Fn(usize) -> bool) {
         let maps = || std::iter::once(&self.labels).chain(&self.whole);
         let mut counts = vec![0usize; self.quality.len()];
@@ -81,7 +81,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn masks_without_used_pixels_go() {
+    fn keep_removes_empty_masks() {
         let mut masks = LevelMasks {
             labels: Image { width: 5, height: 1, data: vec![0, 0, 1, 2, -1] },
             quality: vec![0.1, 0.2, 0.3],
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn iou_is_that_of_the_best_mask_at_any_size_and_specks_do_not_count() {
+    fn best_ious_ignore_size_and_specks() {
         // 20 x 20 truth: label 7 on the left 8 columns, label 9 on 4 pixels; masks at half the
         // size, left 5 columns and rest
         let mut truth = Image::filled(20, 20, 0u32);

@@ -17,24 +17,24 @@ const DIM: usize = splatvk_infer::xfeat::DIM;
 /// half a cell of quantisation on each side, and half a cell for pose errors.
 const BAND_CELLS: f64 = 1.5;
 
-/// Which descriptor matches are accepted.
+/// Acceptance limits of descriptor matches.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct MatchLimits {
     /// Cosine of certainty 0; 1 has certainty 1.
     cosine: f32,
-    /// Neighbouring matches must move alike to within this many cells.
+    /// Largest difference between the displacements of agreeing neighbours, cells.
     agreement: f64,
-    /// How many of the eight neighbours must agree.
+    /// Number of the eight neighbours that must agree.
     neighbours: usize,
 }
 
-/// Chosen for what alignment counts, pixels that land on the right thing. Breakfast views 0 and 1
+/// Chosen for pixels that land on the right thing, which alignment counts. Breakfast views 0 and 1
 /// (25° apart): 42 % of the co-visible pixels are matched, 98.2 % of them on the same object and 62
-/// % within 8 px; asking for 7 neighbours at cosine 0.85 gives 92 % within 8 px and 99.4 % on the
-/// same object, but 6 % of the pixels, too few for an area share.
+/// % within 8 px; 7 neighbours at cosine 0.85 give 92 % within 8 px and 99.4 % on the same object,
+/// but 6 % of the pixels, too few for an area share.
 const MATCH_LIMITS: MatchLimits = MatchLimits { cosine: 0.6, agreement: 0.5, neighbours: 3 };
 
-/// One match between cell centres, refined below the cell in the second view.
+/// A match between cell centres, refined to sub-cell accuracy in the second view.
 #[derive(Clone, Copy)]
 struct Match {
     cell: usize,
@@ -46,10 +46,10 @@ struct Match {
 /// Dense warps i → j and j → i from XFeat descriptors; `cameras` have the working resolution the
 /// features were computed at.
 pub fn xfeat(a: &DenseFeatures, b: &DenseFeatures, cameras: (&Camera, &Camera)) -> (DenseWarp, DenseWarp) {
-    accepted(a, b, cameras, MATCH_LIMITS)
+    match_cells(a, b, cameras, MATCH_LIMITS)
 }
 
-fn accepted(
+fn match_cells(
     a: &DenseFeatures,
     b: &DenseFeatures,
     cameras: (&Camera, &Camera),
@@ -61,9 +61,9 @@ fn accepted(
     let mut matches: Vec<Match> = Vec::new();
     for (cell, best) in forward.iter().enumerate() {
         let Some((target, cosine)) = *best else { continue };
-        // the way back may end in a neighbouring cell: both grids quantise
-        let home = backward[target].is_some_and(|(c, _)| neighbours(c, cell, a.width));
-        if home {
+        // the backward match may be a neighbouring cell, since both grids quantise
+        let consistent = backward[target].is_some_and(|(c, _)| neighbours(c, cell, a.width));
+        if consistent {
             matches.push(Match { cell, a: centre(a, cell), b: refine(a, b, cell, target), cosine });
         }
     }
@@ -77,8 +77,8 @@ fn accepted(
     (there, back)
 }
 
-/// Match field that depth and poses imply: every pixel with known depth, projected; certainty 1
-/// where the other view's depth agrees and the way back returns within `1.5·width/512` pixels.
+/// Warp that depth and poses imply: reprojected pixels, with certainty 1 where the other view's
+/// depth agrees and the forward-backward error is below `1.5·width/512` pixels.
 pub fn geometry(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> DenseWarp {
     let links = super::align::links_from_depth(0, 1, (from, to), (depth, other)).forward;
     let (width, height) = (depth.depth.width, depth.depth.height);
@@ -88,8 +88,8 @@ pub fn geometry(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) 
     };
     for p in 0..width * height {
         if links.target(p).is_some() {
-            let home = DVec2::new((p % width) as f64 + 0.5, (p / width) as f64 + 0.5);
-            let (q, _) = to.project(from.unproject(home, depth.depth.data[p] as f64));
+            let pixel = DVec2::new((p % width) as f64 + 0.5, (p / width) as f64 + 0.5);
+            let (q, _) = to.project(from.unproject(pixel, depth.depth.data[p] as f64));
             warp.target.data[p] = [q.x as f32, q.y as f32];
             warp.certainty.data[p] = 1.0;
         }
@@ -103,16 +103,18 @@ fn fundamental(a: &Camera, b: &Camera) -> DMat3 {
     let t = relative.translation.normalize_or_zero();
     let cross =
         DMat3::from_cols(DVec3::new(0.0, t.z, -t.y), DVec3::new(-t.z, 0.0, t.x), DVec3::new(t.y, -t.x, 0.0));
-    let inverse_k = |c: &Camera| {
-        DMat3::from_cols(
-            DVec3::new(1.0 / c.fx, 0.0, 0.0),
-            DVec3::new(0.0, 1.0 / c.fy, 0.0),
-            DVec3::new(-c.cx / c.fx, -c.cy / c.fy, 1.0),
-        )
-    };
-    inverse_k(b).transpose() * cross * relative.rotation * inverse_k(a)
+    inverse_intrinsics(b).transpose() * cross * relative.rotation * inverse_intrinsics(a)
 }
 
+fn inverse_intrinsics(c: &Camera) -> DMat3 {
+    DMat3::from_cols(
+        DVec3::new(1.0 / c.fx, 0.0, 0.0),
+        DVec3::new(0.0, 1.0 / c.fy, 0.0),
+        DVec3::new(-c.cx / c.fx, -c.cy / c.fy, 1.0),
+    )
+}
+
+/// Pixel position of a cell's centre.
 fn centre(f: &DenseFeatures, cell: usize) -> DVec2 {
     let (x, y) = ((cell % f.width) as f64 + 0.5, (cell / f.width) as f64 + 0.5);
     DVec2::new(x * f.pixels_per_cell[0] as f64, y * f.pixels_per_cell[1] as f64)
@@ -155,53 +157,63 @@ fn neighbours(a: usize, b: usize, width: usize) -> bool {
 /// Peak of a parabola through the similarity of the matched cell and its neighbours, per axis.
 fn refine(a: &DenseFeatures, b: &DenseFeatures, cell: usize, target: usize) -> DVec2 {
     let (x, y) = (target % b.width, target / b.width);
-    let at = |x: usize, y: usize| dot(descriptor(a, cell), descriptor(b, y * b.width + x)) as f64;
-    let peak = |low: f64, mid: f64, high: f64| {
-        let curve = low - 2.0 * mid + high;
-        if curve < 0.0 { (0.5 * (low - high) / curve).clamp(-0.5, 0.5) } else { 0.0 }
-    };
+    let similarity = |x: usize, y: usize| dot(descriptor(a, cell), descriptor(b, y * b.width + x)) as f64;
     let mut shift = DVec2::ZERO;
     if x > 0 && x + 1 < b.width {
-        shift.x = peak(at(x - 1, y), at(x, y), at(x + 1, y));
+        shift.x = parabola_peak(similarity(x - 1, y), similarity(x, y), similarity(x + 1, y));
     }
     if y > 0 && y + 1 < b.height {
-        shift.y = peak(at(x, y - 1), at(x, y), at(x, y + 1));
+        shift.y = parabola_peak(similarity(x, y - 1), similarity(x, y), similarity(x, y + 1));
     }
     centre(b, target) + shift * DVec2::new(b.pixels_per_cell[0] as f64, b.pixels_per_cell[1] as f64)
 }
 
-/// Local Jacobian of each match from the neighbours that move alike; `None` where too few do.
+/// Offset of the maximum of the parabola through three equidistant values, at most half a step.
+fn parabola_peak(low: f64, mid: f64, high: f64) -> f64 {
+    let curve = low - 2.0 * mid + high;
+    if curve < 0.0 { (0.5 * (low - high) / curve).clamp(-0.5, 0.5) } else { 0.0 }
+}
+
+/// Local Jacobian of each match, fitted to its agreeing neighbours; `None` if too few agree.
 fn local_fits(a: &DenseFeatures, matches: &[Match], limits: MatchLimits) -> Vec<Option<DMat2>> {
-    let mut at = vec![None; a.width * a.height];
+    let mut match_at = vec![None; a.width * a.height];
     for (k, m) in matches.iter().enumerate() {
-        at[m.cell] = Some(k);
+        match_at[m.cell] = Some(k);
     }
+    matches.par_iter().map(|m| local_fit(m, a, matches, &match_at, limits)).collect()
+}
+
+/// Local Jacobian of one match; `match_at` has the index of the match in each cell.
+fn local_fit(
+    m: &Match,
+    a: &DenseFeatures,
+    matches: &[Match],
+    match_at: &[Option<usize>],
+    limits: MatchLimits,
+) -> Option<DMat2> {
     let cell = a.pixels_per_cell[0].max(a.pixels_per_cell[1]) as f64;
-    let fit = |m: &Match| {
-        let (x, y) = ((m.cell % a.width) as isize, (m.cell / a.width) as isize);
-        let (mut agreeing, mut normal, mut moved) = (0, DMat2::ZERO, DMat2::ZERO);
-        for (dx, dy) in [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)] {
-            let (nx, ny) = (x + dx, y + dy);
-            if nx < 0 || ny < 0 || nx >= a.width as isize || ny >= a.height as isize {
-                continue;
-            }
-            let Some(other) = at[ny as usize * a.width + nx as usize].map(|k: usize| &matches[k]) else {
-                continue;
-            };
-            let (u, v) = (other.a - m.a, other.b - m.b);
-            if (u - v).length() <= limits.agreement * cell {
-                agreeing += 1;
-                normal += DMat2::from_cols(u * u.x, u * u.y);
-                moved += DMat2::from_cols(v * u.x, v * u.y);
-            }
+    let (x, y) = ((m.cell % a.width) as isize, (m.cell / a.width) as isize);
+    let (mut agreeing, mut normal, mut moved) = (0, DMat2::ZERO, DMat2::ZERO);
+    for (dx, dy) in [(-1, -1), (0, -1), (1, -1), (-1, 0), (1, 0), (-1, 1), (0, 1), (1, 1)] {
+        let (nx, ny) = (x + dx, y + dy);
+        if nx < 0 || ny < 0 || nx >= a.width as isize || ny >= a.height as isize {
+            continue;
         }
-        // half a neighbourhood's weight on the identity: parabola peaks scatter by a pixel or two
-        let ridge = 4.0 * cell * cell;
-        let identity = DMat2::from_diagonal(DVec2::splat(ridge));
-        let jacobian = (moved + identity) * (normal + identity).inverse();
-        (agreeing >= limits.neighbours && jacobian.determinant() > 0.1).then_some(jacobian)
-    };
-    matches.par_iter().map(fit).collect()
+        let Some(other) = match_at[ny as usize * a.width + nx as usize].map(|k| &matches[k]) else {
+            continue;
+        };
+        let (u, v) = (other.a - m.a, other.b - m.b);
+        if (u - v).length() <= limits.agreement * cell {
+            agreeing += 1;
+            normal += DMat2::from_cols(u * u.x, u * u.y);
+            moved += DMat2::from_cols(v * u.x, v * u.y);
+        }
+    }
+    // half a neighbourhood's weight on the identity: parabola peaks scatter by a pixel or two
+    let ridge = 4.0 * cell * cell;
+    let identity = DMat2::from_diagonal(DVec2::splat(ridge));
+    let jacobian = (moved + identity) * (normal + identity).inverse();
+    (agreeing >= limits.neighbours && jacobian.determinant() > 0.1).then_some(jacobian)
 }
 
 /// Paints each match over the pixels nearest to it, within one cell.
@@ -249,7 +261,7 @@ mod tests {
     }
 
     #[test]
-    fn matches_agree_with_the_exact_geometry() {
+    fn xfeat_warps_agree_with_geometry() {
         let views = train_views();
         let mut net = XFeat::load(&Registry::open(None).unwrap()).unwrap();
         let f: Vec<DenseFeatures> = views.iter().take(2).map(|v| net.dense(&v.image).unwrap()).collect();
@@ -257,7 +269,7 @@ mod tests {
         let exact = geometry(&a.camera, &depth(a), &b.camera, &depth(b));
         let total = exact.certainty.data.iter().filter(|&&c| c > 0.0).count();
         let score = |limits: MatchLimits| {
-            let (there, back) = accepted(&f[0], &f[1], (&a.camera, &b.camera), limits);
+            let (there, back) = match_cells(&f[0], &f[1], (&a.camera, &b.camera), limits);
             let links = links_from_warps(0, 1, &there, &back);
             let (mut kept, mut close, mut label) = (0, 0, 0);
             for p in 0..there.target.data.len() {
@@ -275,13 +287,13 @@ mod tests {
         };
         let (kept, close, label) = score(MATCH_LIMITS);
         assert!(kept > total / 3 && 2 * close > kept, "{kept} {close}");
-        // 70 % of the image is table and wall: matches spread evenly would agree in about half of
-        // the cases
+        // 70 % of the image is table and wall: uniformly random matches agree in about half of the
+        // cases
         assert!(label as f64 > 0.97 * kept as f64, "{label} of {kept}");
     }
 
     #[test]
-    fn the_geometric_warp_returns_home() {
+    fn geometry_warp_is_consistent() {
         let views = train_views();
         let (a, b) = (&views[1], &views[2]);
         let (da, db) = (depth(a), depth(b));

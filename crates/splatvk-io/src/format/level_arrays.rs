@@ -1,12 +1,12 @@
-//! What the splats carry on each level, as named arrays: the same in a scene directory and beside a
-//! file of Gaussians (docs/use/formats.md#features-of-splats).
+//! Language data of the splats on each level, as named arrays: the same in a scene directory and
+//! beside a file of Gaussians (docs/use/formats.md#features-of-splats).
 use super::npy::{NpyArray, NpyData};
 use crate::scene::{CodeMix, Codebook, LevelField};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 
-/// Adds the arrays of a level with codes. Row r is splat `order[r]`; an empty order is the scene's
-/// own.
+/// Appends the arrays of a level with codes. Row r is splat `order[r]`; an empty order is the
+/// scene's own.
 pub fn append(
     arrays: &mut Vec<(String, NpyArray)>,
     name: &str,
@@ -26,17 +26,17 @@ pub fn append(
     };
     let mut put = |kind: &str, array: NpyArray| arrays.push((format!("{kind}_{name}"), array));
     if level.mixes.len() == splats {
-        let index = |of: fn(&CodeMix) -> u16| {
+        let code_array = |of: fn(&CodeMix) -> u16| {
             let values = rows.iter().map(|&i| of(&level.mixes[i]));
-            // The number of codes itself stands for no feature.
+            // The number of codes itself encodes "no feature".
             let data = match book.len() {
                 0..=255 => NpyData::U8(values.map(|v| v as u8).collect()),
                 _ => NpyData::I32(values.map(i32::from).collect()),
             };
             NpyArray { shape: vec![rows.len()], data }
         };
-        put("first", index(|m| m.first));
-        put("second", index(|m| m.second));
+        put("first", code_array(|m| m.first));
+        put("second", code_array(|m| m.second));
         put("share", NpyArray::u8(&[rows.len()], rows.iter().map(|&i| level.mixes[i].share).collect()));
     } else {
         let d = book.code_dim;
@@ -50,8 +50,8 @@ pub fn append(
     Ok(())
 }
 
-/// A codebook of the arrays clip [K, D], code [K, d], weight [K] and delta_min, without members;
-/// `Err` says what does not fit.
+/// Codebook from the arrays clip [K, D], code [K, d], weight [K] and delta_min, without members;
+/// `Err` describes the mismatch.
 pub fn codebook([clip, code, weight, delta_min]: [&NpyArray; 4]) -> std::result::Result<Codebook, String> {
     let (&[k, embedding_dim], &[k2, code_dim]) = (&clip.shape[..], &code.shape[..]) else {
         return Err("its codes have no two dimensions".to_owned());
@@ -75,8 +75,7 @@ pub fn codebook([clip, code, weight, delta_min]: [&NpyArray; 4]) -> std::result:
     Ok(book)
 }
 
-/// Refuses a codebook with numbers that are not finite: what would be refused when it is read is
-/// not written either.
+/// Refuses a codebook with numbers that are not finite, on reading and on writing.
 pub fn check(book: &Codebook) -> std::result::Result<(), String> {
     finite("its embeddings", &book.embeddings, book.embedding_dim)?;
     finite("its codes", &book.codes, book.code_dim)?;
@@ -84,7 +83,8 @@ pub fn check(book: &Codebook) -> std::result::Result<(), String> {
     finite("delta_min", &[book.min_chord], 1)
 }
 
-/// Refuses numbers that are not finite, with their count and the first row of `width` that has one.
+/// Refuses numbers that are not finite; the error has their count and the first row of `width` with
+/// one.
 fn finite(what: &str, values: &[f32], width: usize) -> std::result::Result<(), String> {
     let mut bad = values.iter().enumerate().filter(|(_, v)| !v.is_finite()).map(|(i, _)| i / width);
     match bad.next() {
@@ -95,7 +95,7 @@ fn finite(what: &str, values: &[f32], width: usize) -> std::result::Result<(), S
     }
 }
 
-/// Reads what [`append`] wrote into a level whose codebook is there; `Err` says what does not fit.
+/// Reads the arrays of [`append`] into a level whose codebook is set; `Err` describes the mismatch.
 pub fn read(
     arrays: &BTreeMap<String, NpyArray>,
     name: &str,
@@ -109,7 +109,7 @@ pub fn read(
         Some(a) => Err(format!("array {kind}_{name} has the shape {:?} for {splats} splats", a.shape)),
         None => Err(format!("no array {kind}_{name}")),
     };
-    // Scenes of version 1 have the bare name of the level.
+    // Scenes of version 1 use the bare name of the level.
     match get("features").or_else(|| arrays.get(name)) {
         Some(a) if a.shape == [splats, d] => {
             level.features = a.to_f32();
@@ -127,7 +127,7 @@ pub fn read(
                 second: *b as u16,
                 share: *s as u8,
             };
-            level.carry_mixes(first.iter().zip(&second).zip(&share).map(mix).collect());
+            level.set_mixes(first.iter().zip(&second).zip(&share).map(mix).collect());
         }
     }
     if get("reliability").is_some() {
@@ -141,7 +141,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_of_codes_beyond_a_byte_come_back() {
+    fn code_indices_beyond_byte_survive() {
         let codes = 300;
         let codebook = Codebook {
             embedding_dim: 1,
@@ -154,7 +154,7 @@ mod tests {
         let mut level = LevelField { codebook: codebook.clone(), ..LevelField::default() };
         let mixes =
             [(299, 43), (7, 256), (300, 300)].map(|(first, second)| CodeMix { first, second, share: 9 });
-        level.carry_mixes(mixes.to_vec());
+        level.set_mixes(mixes.to_vec());
         let mut arrays = Vec::new();
         append(&mut arrays, "s", &level, 3, &[]).unwrap();
         let arrays: BTreeMap<String, NpyArray> = arrays.into_iter().collect();

@@ -1,4 +1,5 @@
-//! Accepted edges → things (docs/internals/method.md#components).
+//! Builds components, the things of a scene, from accepted edges
+//! (docs/internals/method.md#components).
 use super::Edge;
 use super::score::LevelState;
 use crate::scene::MaskId;
@@ -10,7 +11,8 @@ use std::collections::{BTreeMap, BTreeSet};
 pub struct Component {
     /// Ascending.
     pub members: Vec<MaskId>,
-    /// The member whose feature stands for all: the weighted medoid, so an actual feature vector.
+    /// Weighted medoid: the member whose feature, an actual feature vector, stands for the
+    /// component.
     pub medoid: MaskId,
     /// Σ of the members' weights (pixels × quality).
     pub weight: f64,

@@ -9,18 +9,18 @@ use serde::{Deserialize, Serialize};
 /// No correspondence.
 const NONE: u32 = u32::MAX;
 
-/// RoMa's probability above which a match counts (docs/internals/method.md#pixel-matching).
+/// Certainty of RoMa above which a match is accepted (docs/internals/method.md#pixel-matching).
 const MIN_CERTAINTY: f32 = 0.35;
 
-/// Relative depth difference that occlusion tests and the round trip allow
+/// Tolerance of relative depth differences in the occlusion test and the round trip
 /// (docs/internals/method.md#reprojection).
 const DEPTH_TOLERANCE: f64 = 0.05;
 
-/// Bilinear depth is used only where its four neighbours lie on one surface: max/min below this
+/// Largest ratio of the four neighbouring depths that are interpolated as one surface
 /// (docs/internals/method.md#reprojection).
 const SAME_SURFACE: f32 = 1.06;
 
-/// Where each pixel of one view lands in the other.
+/// Corresponding pixels of one view in another.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Links {
     /// [H·W] pixel index in the other view, `u32::MAX` = none.
@@ -61,26 +61,32 @@ pub struct PairLinks {
 }
 
 impl PairLinks {
-    /// The same pair seen from the other side.
+    /// Exchanges the two views.
     pub fn swapped(self) -> Self {
         PairLinks { i: self.j, j: self.i, forward: self.backward, backward: self.forward }
     }
 }
 
-/// Correspondences of two views from one camera: the same pixel, where both show the same surface.
+/// Links of two views from one camera: equal pixels, where `same` is true.
 pub fn links_from_overlay(i: usize, j: usize, same: &[bool]) -> PairLinks {
     let target = same.iter().zip(0..).map(|(s, p)| if *s { p } else { NONE }).collect();
     let links = Links { target, visible: same.to_vec() };
     PairLinks { i, j, forward: links.clone(), backward: links }
 }
 
-/// Step 1: keeps matches that are certain, inside, and return to where they came from within
+/// Step 1: keeps certain matches inside the other view whose forward-backward error is below
 /// `max(2, 0.004·width)` pixels.
 pub fn links_from_warps(i: usize, j: usize, forward: &DenseWarp, backward: &DenseWarp) -> PairLinks {
-    PairLinks { i, j, forward: one_way(forward, backward), backward: one_way(backward, forward) }
+    PairLinks {
+        i,
+        j,
+        forward: consistent_links(forward, backward),
+        backward: consistent_links(backward, forward),
+    }
 }
 
-fn one_way(warp: &DenseWarp, back: &DenseWarp) -> Links {
+/// Links of the certain matches whose forward-backward error is small.
+fn consistent_links(warp: &DenseWarp, back: &DenseWarp) -> Links {
     let (width, other) = (warp.target.width, &back.target);
     let tolerance = (0.004 * width as f32).max(2.0);
     let target = (0..warp.target.data.len()).into_par_iter().map(|p| {
@@ -88,11 +94,9 @@ fn one_way(warp: &DenseWarp, back: &DenseWarp) -> Links {
         if warp.certainty.data[p] <= MIN_CERTAINTY {
             return NONE;
         }
-        let Some(index) = pixel(q, other.width, other.height) else { return NONE };
+        let Some(index) = pixel_index(q, other.width, other.height) else { return NONE };
         let home = [(p % width) as f32 + 0.5, (p / width) as f32 + 0.5];
-        // the exact return position is that of q, one pixel centre away at most: interpolate when
-        // possible
-        let r = sample(other, q);
+        let r = return_position(other, q);
         let error = ((r[0] - home[0]).powi(2) + (r[1] - home[1]).powi(2)).sqrt();
         if back.certainty.data[index] > 0.0 && error < tolerance { index as u32 } else { NONE }
     });
@@ -101,22 +105,22 @@ fn one_way(warp: &DenseWarp, back: &DenseWarp) -> Links {
 }
 
 /// Index of the pixel that a position falls into.
-fn pixel(q: [f32; 2], width: usize, height: usize) -> Option<usize> {
+fn pixel_index(q: [f32; 2], width: usize, height: usize) -> Option<usize> {
     let inside = q[0] >= 0.0 && q[1] >= 0.0 && q[0] < width as f32 && q[1] < height as f32;
     inside.then(|| q[1] as usize * width + q[0] as usize)
 }
 
-/// Return position at q: the value of q's pixel shifted by q's offset from that pixel's centre,
-/// that is a first-order step with the identity Jacobian, which does not smear across
-/// discontinuities as interpolation would.
-fn sample(map: &Image<[f32; 2]>, q: [f32; 2]) -> [f32; 2] {
+/// Position to which `map` returns `q`: the value of q's pixel, shifted by q's offset from the
+/// pixel centre. Unlike interpolation, this first-order step with the identity Jacobian does not
+/// blur discontinuities.
+fn return_position(map: &Image<[f32; 2]>, q: [f32; 2]) -> [f32; 2] {
     let (x, y) = (q[0] as usize, q[1] as usize);
     let v = map.at(x.min(map.width - 1), y.min(map.height - 1));
     [v[0] + (q[0] - x as f32 - 0.5), v[1] + (q[1] - y as f32 - 0.5)]
 }
 
-/// Step 3: projects every pixel with known depth into the other view and keeps it if that view sees
-/// the same surface there and projecting back returns to it within `1.5·width/512` pixels.
+/// Step 3: reprojects every pixel with known depth and keeps it if the other view shows the same
+/// surface there and the forward-backward error is below `1.5·width/512` pixels.
 pub fn links_from_depth(
     i: usize,
     j: usize,
@@ -126,12 +130,12 @@ pub fn links_from_depth(
     PairLinks {
         i,
         j,
-        forward: project(cameras.0, depths.0, cameras.1, depths.1),
-        backward: project(cameras.1, depths.1, cameras.0, depths.0),
+        forward: reproject(cameras.0, depths.0, cameras.1, depths.1),
+        backward: reproject(cameras.1, depths.1, cameras.0, depths.0),
     }
 }
 
-fn project(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> Links {
+fn reproject(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> Links {
     let width = depth.depth.width;
     // 1.5 px on the 512-pixel grid that the tolerance was chosen on
     let tolerance = 1.5 * width as f64 / 512.0;
@@ -146,7 +150,8 @@ fn project(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> Li
             let home = DVec2::new((p % width) as f64 + 0.5, (p / width) as f64 + 0.5);
             let (q, zq) = to.project(from.unproject(home, z));
             let position = [q.x as f32, q.y as f32];
-            let Some(index) = pixel(position, other.depth.width, other.depth.height).filter(|_| zq > 0.0)
+            let Some(index) =
+                pixel_index(position, other.depth.width, other.depth.height).filter(|_| zq > 0.0)
             else {
                 return (NONE, false);
             };
@@ -154,8 +159,7 @@ fn project(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> Li
             if d <= 0.0 {
                 return (NONE, true);
             }
-            // something nearer stands in front: this pixel cannot be seen from there and must not
-            // count against it
+            // an occluded pixel cannot have a match and must not lower the coverage
             let hidden = d < zq * (1.0 - DEPTH_TOLERANCE);
             let returned = back.transform(to.ray(q) * d);
             let u = DVec2::new(
@@ -171,8 +175,7 @@ fn project(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> Li
     Links { target: rows.iter().map(|r| r.0).collect(), visible: rows.iter().map(|r| r.1).collect() }
 }
 
-/// Depth at a position: bilinear on one surface, else that of the pixel it falls into; ≤ 0 when
-/// unknown.
+/// Depth at a position: bilinear on one surface, else nearest; ≤ 0 when unknown.
 fn surface_depth(depth: &Image<f32>, q: [f32; 2], index: usize) -> f64 {
     let nearest = depth.data[index] as f64;
     let (fx, fy) = (q[0] - 0.5, q[1] - 0.5);

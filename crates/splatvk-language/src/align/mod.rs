@@ -1,5 +1,5 @@
-//! Three-step semantic alignment (docs/internals/method.md#alignment): which masks of different
-//! views are the same thing.
+//! Three-step semantic alignment (docs/internals/method.md#alignment): finds the masks of different
+//! views that show one thing.
 //!
 //! Step 1 scores mask pairs by dense matches, step 2 fuses masks that one view splits and another
 //! keeps whole, step 3 re-scores by reprojection through depth and poses. Accepted pairs are
@@ -22,7 +22,7 @@ use super::ViewMasks;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// What alignment did on one level, for run.json.
+/// Statistics of the alignment of one level, for run.json.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct LevelReport {
@@ -38,7 +38,7 @@ pub struct LevelReport {
     pub mean_cosine: f64,
 }
 
-/// The outcome: masks with fused labels, and per level the things they form.
+/// Result of the alignment: masks with fused labels, and per level the things they form.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Alignment {
     /// The input masks; fused masks carry the smallest id of their set (absorbed ids have no pixel

@@ -2,7 +2,7 @@
 use crate::scene::MaskId;
 use serde::{Deserialize, Serialize};
 
-/// How the share of a target mask is measured (docs/internals/method.md#pixel-matching).
+/// Measure of the area share of a target mask (docs/internals/method.md#pixel-matching).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
@@ -12,9 +12,8 @@ pub enum AreaScore {
     Coverage,
     /// Matched source pixels over target pixels, at most 1: the paper's ratio.
     Paper,
-    /// Share of the target's pixels at whose place the source view has a match of any mask: what
-    /// the authors' code scores step 1 by, as if nothing moved between the views. Step 3 has the
-    /// paper's ratio.
+    /// Share of the target's pixels at whose position the source view has a match of any mask: the
+    /// score of step 1 in the authors' code, which ignores motion. Step 3 uses the paper's ratio.
     SamePlace,
 }
 
@@ -27,7 +26,7 @@ pub struct AlignOptions {
     pub tau2: f64,
     /// Weight of the feature cosine; the area share has 1 − λ.
     pub lambda: f64,
-    /// Area share.
+    /// Measure of the area share.
     pub area: AreaScore,
     /// Matched pixels needed, as a share of the image ([`AlignOptions::min_matches`]).
     pub min_match_share: f64,
@@ -56,7 +55,7 @@ impl Default for AlignOptions {
 }
 
 impl AlignOptions {
-    /// The default.
+    /// Default thresholds.
     pub const DEFAULT: AlignOptions = AlignOptions {
         tau1: 0.5,
         tau2: 0.5,
@@ -73,7 +72,8 @@ impl AlignOptions {
         mutual: true,
     };
 
-    /// Matched pixels that make a pair of masks worth scoring: 150 at 0.73 megapixels, at least 32.
+    /// Smallest number of matched pixels for which a pair of masks is scored: 150 at 0.73
+    /// megapixels, at least 32.
     pub fn min_matches(&self, pixels: usize) -> u32 {
         ((self.min_match_share * pixels as f64).round() as u32).max(32)
     }
@@ -96,7 +96,7 @@ pub struct Edge {
     pub score: f64,
 }
 
-/// Two masks of a view that fusion made one. Stored as `[view, kept, absorbed]`.
+/// Two masks of a view that fusion joined. Stored as `[view, kept, absorbed]`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(from = "(u32, u32, u32)", into = "(u32, u32, u32)")]
 pub struct Fusion {
@@ -104,7 +104,7 @@ pub struct Fusion {
     pub view: u32,
     /// The mask that remains.
     pub kept: u32,
-    /// The mask whose pixels went to it.
+    /// The mask whose pixels it takes over.
     pub absorbed: u32,
 }
 

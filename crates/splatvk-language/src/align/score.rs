@@ -18,8 +18,7 @@ pub(super) struct LevelState {
 
 impl LevelState {
     pub fn new(views: &[ViewMasks], level: usize) -> Self {
-        let pick = |v: &ViewMasks| v.levels[level].clone();
-        let levels: Vec<_> = views.iter().map(pick).collect();
+        let levels: Vec<_> = views.iter().map(|v| v.levels[level].clone()).collect();
         let mut state = LevelState {
             areas: Vec::new(),
             labels: levels.iter().map(|l| l.labels.clone()).collect(),
@@ -38,8 +37,8 @@ impl LevelState {
     }
     pub fn feature(&self, MaskId { view, mask }: MaskId) -> &[f32] {
         let dim = self.features[view as usize].len() / self.quality[view as usize].len().max(1);
-        let at = mask as usize * dim;
-        &self.features[view as usize][at..at + dim]
+        let start = mask as usize * dim;
+        &self.features[view as usize][start..start + dim]
     }
     /// Cosine of two unit features.
     pub fn cosine(&self, a: MaskId, b: MaskId) -> f64 {
@@ -58,7 +57,7 @@ impl LevelState {
             (out.labels, out.features, out.quality) = (labels, features, quality);
         }
     }
-    /// Pixels of each mask pair that the links join: (mask of `from`, mask of `to`) → pixels.
+    /// Number of links between each mask of `from` and each mask of `to`.
     fn counts(&self, from: usize, to: usize, links: &Links) -> Counts {
         let mut counts = Counts { cols: self.quality[to].len(), data: Vec::new() };
         counts.data = vec![0; self.quality[from].len() * counts.cols];
@@ -71,8 +70,8 @@ impl LevelState {
         }
         counts
     }
-    /// Pixels of each mask of `view` at whose place the view that `links` start from has a match.
-    fn matched_places(&self, view: usize, links: &Links) -> Vec<u32> {
+    /// Number of pixels of each mask of `view` whose position has a match in `links`.
+    fn matched_positions(&self, view: usize, links: &Links) -> Vec<u32> {
         let mut area = vec![0; self.quality[view].len()];
         for (p, &b) in self.labels[view].data.iter().enumerate() {
             if b >= 0 && links.target(p).is_some() {
@@ -145,8 +144,8 @@ pub(super) fn match_proposals(
     let mut table = Table::new();
     for (i, j, links, back) in pairs.iter().flat_map(directions) {
         let (there, back) = (state.counts(i, j, links), state.counts(j, i, back));
-        let same_place = match options.area {
-            AreaScore::SamePlace => state.matched_places(j, links),
+        let matched = match options.area {
+            AreaScore::SamePlace => state.matched_positions(j, links),
             _ => Vec::new(),
         };
         let n_min = options.min_matches(state.labels[i].data.len());
@@ -160,7 +159,7 @@ pub(super) fn match_proposals(
             let area = match options.area {
                 AreaScore::Coverage => back.at(b, a) as f64 / size,
                 AreaScore::Paper => (there.at(a, b) as f64 / size).min(1.0),
-                AreaScore::SamePlace => same_place[b] as f64 / size,
+                AreaScore::SamePlace => matched[b] as f64 / size,
             };
             let e = edge(state, step, source, MaskId::new(j, b), area, options);
             if e.score > options.tau1 {
@@ -190,7 +189,7 @@ struct FusionSet {
 }
 
 /// Step 2 (docs/internals/method.md#mask-fusion): relabels every fusion set to its smallest id;
-/// returns what was fused.
+/// returns the joined pairs.
 pub(super) fn fuse(state: &mut LevelState, pairs: &[PairLinks], options: &AlignOptions) -> Vec<Fusion> {
     let mut sets = fusion_sets(state, pairs, options);
     sets.sort_by(|x, y| {
@@ -198,7 +197,7 @@ pub(super) fn fuse(state: &mut LevelState, pairs: &[PairLinks], options: &AlignO
     });
     let mut parent: Vec<Vec<usize>> = state.quality.iter().map(|q| (0..q.len()).collect()).collect();
     let mut taken = BTreeSet::new();
-    let mut named = Vec::new();
+    let mut features = Vec::new();
     for set in &sets {
         // a mask joins at most one fusion set per target view
         let fresh = |m: &usize| !taken.contains(&(set.view, *m, set.target.view));
@@ -210,13 +209,13 @@ pub(super) fn fuse(state: &mut LevelState, pairs: &[PairLinks], options: &AlignO
             taken.insert((set.view, m, set.target.view));
             join(&mut parent[set.view], members[0], m);
         }
-        named.push((set.view, members[0], state.feature(set.target).to_vec()));
+        features.push((set.view, members[0], state.feature(set.target).to_vec()));
     }
-    // The fused mask takes the feature of the mask that covers it whole
-    // (docs/internals/method.md#mask-fusion): the strongest set that it is in writes last.
-    for (view, member, feature) in named.into_iter().rev() {
-        let at = find(&parent[view], member) * feature.len();
-        state.features[view][at..at + feature.len()].copy_from_slice(&feature);
+    // The fused mask takes the feature of its target mask (docs/internals/method.md#mask-fusion).
+    // The strongest set is applied last, so its feature remains.
+    for (view, member, feature) in features.into_iter().rev() {
+        let start = find(&parent[view], member) * feature.len();
+        state.features[view][start..start + feature.len()].copy_from_slice(&feature);
     }
     let mut fused = Vec::new();
     for (view, parent) in parent.iter().enumerate() {
@@ -281,7 +280,7 @@ fn fusion_sets(state: &LevelState, pairs: &[PairLinks], options: &AlignOptions) 
                     .all(|&o| state.cosine(MaskId::new(i, a), MaskId::new(i, o)) >= options.veto)
             };
             let coverage = members.iter().map(|&a| back.at(b, a) as f64).sum::<f64>() / size;
-            // little of the target covered: the members need not be all of it
+            // with little coverage the members may be only a part of the target
             if coverage >= options.fusion_cover && members.iter().all(contained) && members.iter().all(alike)
             {
                 sets.push(FusionSet { view: i, members, target, coverage });
@@ -349,8 +348,8 @@ fn drop_contradicted(table: &mut Table, (i, j): (usize, usize), there: &Counts, 
     });
 }
 
-/// One edge per unordered pair of masks, the larger score wins; best first, geometry first among
-/// equals.
+/// Keeps the edge with the largest score per unordered pair of masks; best first, step 3 first
+/// among equal scores.
 pub(super) fn undirected(table: Table) -> Vec<Edge> {
     let mut best: BTreeMap<(MaskId, MaskId), Edge> = BTreeMap::new();
     for e in table.into_values() {

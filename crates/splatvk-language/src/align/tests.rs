@@ -123,7 +123,7 @@ impl Scene {
 }
 
 #[test]
-fn whole_objects_are_linked_and_nothing_else() {
+fn align_links_whole_objects_only() {
     let s = scene(false);
     let (matched, projected) = (s.matched(), s.projected());
     let mut cosine = Vec::new();
@@ -140,7 +140,7 @@ fn whole_objects_are_linked_and_nothing_else() {
 }
 
 #[test]
-fn split_objects_are_fused_above_the_finest_level() {
+fn fusion_joins_pieces_above_finest_level() {
     let s = scene(true);
     let a = align(&s.views, &s.matched(), &s.projected(), &AlignOptions::default()).unwrap();
     let (purity, completeness) = s.purity_completeness(&a, 2);
@@ -164,14 +164,14 @@ fn split_objects_are_fused_above_the_finest_level() {
     assert!(again.report.iter().all(|r| r.fused.is_empty()));
 }
 
-/// Components as sets of (original view, object-free mask id).
+/// Components as sets of (original view, mask id).
 fn partition(a: &Alignment, order: &[u32], level: usize) -> BTreeSet<BTreeSet<(u32, u32)>> {
     let rename = |c: &Component| c.members.iter().map(|m| (order[m.view as usize], m.mask)).collect();
     a.components[level].iter().map(rename).collect()
 }
 
 #[test]
-fn the_order_of_the_views_does_not_matter() {
+fn align_ignores_view_order() {
     let s = scene(true);
     let options = AlignOptions::default();
     let base = align(&s.views, &s.matched(), &s.projected(), &options).unwrap();
@@ -193,7 +193,7 @@ fn the_order_of_the_views_does_not_matter() {
 }
 
 #[test]
-fn higher_thresholds_never_add_edges() {
+fn align_higher_threshold_adds_no_edges() {
     let s = scene(true);
     let (matched, projected) = (s.matched(), s.projected());
     let mut previous: Option<BTreeSet<(MaskId, MaskId)>> = None;
@@ -229,13 +229,13 @@ fn pole_view(x: f64, back: f64) -> (Camera, DepthMap, Image<i32>) {
         for col in 0..width {
             let ray = camera.ray(glam::DVec2::new(col as f64 + 0.5, row as f64 + 0.5));
             let (pole, wall) = (2.0 + back, 4.0 + back);
-            let at = |z: f64| DVec3::new(ray.x * z + x, ray.y * z, z);
+            let point = |z: f64| DVec3::new(ray.x * z + x, ray.y * z, z);
             let p = row * width + col;
-            if at(pole).x.abs() < 0.06 {
+            if point(pole).x.abs() < 0.06 {
                 (depth.data[p], labels.data[p]) = (pole as f32, 1);
             } else {
                 // a picture on the wall
-                let on = at(wall);
+                let on = point(wall);
                 let picture = on.x.abs() < 0.9 && on.y.abs() < 0.7;
                 (depth.data[p], labels.data[p]) = (wall as f32, if picture { 2 } else { 0 });
             }
@@ -244,7 +244,7 @@ fn pole_view(x: f64, back: f64) -> (Camera, DepthMap, Image<i32>) {
     (camera, exact_depth(&depth), labels)
 }
 
-/// All three masks look alike, so that only geometry can tell them apart.
+/// Three masks with equal features, so that only geometry separates them.
 fn alike(labels: Image<i32>) -> ViewMasks {
     let mut row = [0.0; DIM];
     row[0] = 1.0;
@@ -254,7 +254,7 @@ fn alike(labels: Image<i32>) -> ViewMasks {
 }
 
 #[test]
-fn a_pole_does_not_link_to_the_wall_behind_it() {
+fn align_keeps_pole_and_wall_apart() {
     let (a, b) = (pole_view(-0.3, 0.0), pole_view(0.4, 0.0));
     let mut views = [alike(a.2), alike(b.2)];
     let projected = [links_from_depth(0, 1, (&a.0, &b.0), (&a.1, &b.1))];
@@ -265,7 +265,7 @@ fn a_pole_does_not_link_to_the_wall_behind_it() {
         out.components[0].iter().map(|c| c.members.iter().map(|m| m.mask).collect()).collect();
     assert_eq!(pairs, [0, 1, 2].map(|k| BTreeSet::from([k])).into());
     assert!(out.components[0].iter().all(|c| c.members.len() == 2));
-    // A picture that looks like another one is another thing, though it hangs in the same place.
+    // Masks with different features stay apart although geometry joins them.
     views[1].levels[0].features[2 * DIM..].rotate_right(1);
     let out = align(&views, &matched, &projected, &AlignOptions::default()).unwrap();
     assert!(out.report[0].edges.iter().any(|e| (e.from.mask, e.to.mask) == (2, 2)), "geometry joins them");
@@ -274,9 +274,8 @@ fn a_pole_does_not_link_to_the_wall_behind_it() {
 }
 
 #[test]
-fn geometry_deletes_a_match_that_it_contradicts() {
-    // Matches join the mask of view 0 with the first of view 1; by depth and poses it is the
-    // second.
+fn reprojection_deletes_contradicted_matches() {
+    // Matches join the mask of view 0 with the first mask of view 1, geometry with the second.
     let (width, height) = (60, 10);
     let view = |features: &[f32], label: &dyn Fn(usize) -> i32| {
         let data = (0..width * height).map(|p| label(p % width)).collect();
@@ -303,9 +302,8 @@ fn geometry_deletes_a_match_that_it_contradicts() {
 }
 
 #[test]
-fn coverage_does_not_depend_on_distance_but_the_papers_ratio_does() {
-    // view 1 stands at twice the distance from the picture: it shows it with a quarter of the
-    // pixels
+fn area_score_coverage_ignores_distance() {
+    // view 1 has twice the distance from the picture and shows it with a quarter of the pixels
     let (near, far) = (pole_view(0.0, 0.0), pole_view(0.0, 4.0));
     let views = [alike(near.2), alike(far.2)];
     let warps = (
@@ -322,12 +320,12 @@ fn coverage_does_not_depend_on_distance_but_the_papers_ratio_does() {
     let (out, back) = scores(AreaScore::Coverage);
     assert!(out > 0.8 && back > 0.8, "{out} {back}");
     let (_, back) = scores(AreaScore::Paper);
-    // from the far view: a quarter of the near picture's pixels can ever match
+    // the far view can match at most a quarter of the near picture's pixels
     assert!(back < 0.3 + 0.7 * 0.3, "{back}");
 }
 
 #[test]
-fn duplicates_empty_levels_and_single_views() {
+fn align_handles_degenerate_views() {
     let s = scene(false);
     let twice = [s.views[0].clone(), s.views[0].clone()];
     let (w, h) = (640, 480);
@@ -351,9 +349,9 @@ fn duplicates_empty_levels_and_single_views() {
 }
 
 #[test]
-fn a_mask_of_two_fusion_sets_takes_the_feature_of_the_stronger() {
-    // View 0 has pieces 0, 1, 2 side by side; one mask of view 1 covers 0 and 1, one of view 2
-    // covers 1 and 2.
+fn fuse_takes_feature_of_stronger_set() {
+    // View 0 has pieces 0, 1, 2 side by side; a mask of view 1 covers 0 and 1, one of view 2 covers
+    // 1 and 2.
     let (width, height) = (120, 10);
     let view = |rows: &[[f32; 3]], label: &dyn Fn(usize) -> i32| {
         let unit = |r: &[f32; 3]| r.map(|v| v / r.iter().map(|v| v * v).sum::<f32>().sqrt());
@@ -369,7 +367,7 @@ fn a_mask_of_two_fusion_sets_takes_the_feature_of_the_stronger() {
     let first = view(&[[1.0, 0.0, 0.0]; 3], &|x| if x < 60 { x as i32 / 20 } else { -1 });
     let left = view(&[[1.0, 0.3, 0.0]], &|x| if x < 40 { 0 } else { -1 });
     let right = view(&[[1.0, 0.0, 0.3]], &|x| if (20..60).contains(&x) { 0 } else { -1 });
-    // Matches cover all of the one target, and of the other the share that is asked for.
+    // Matches cover all rows of one target and eight of ten rows of the other.
     let links = |view: usize, rows: usize| {
         let same: Vec<bool> = (0..width * height).map(|p| p / width < rows).collect();
         links_from_overlay(0, view, &same)
@@ -384,8 +382,8 @@ fn a_mask_of_two_fusion_sets_takes_the_feature_of_the_stronger() {
 }
 
 #[test]
-fn the_authors_ratio_knows_only_things_that_stay_in_place() {
-    // One thing that is ten pixels wide, and as far to the right in view 1 as `shift` says.
+fn same_place_score_fails_under_motion() {
+    // One thing of ten pixels' width, moved to the right by `shift` pixels in view 1.
     let (width, height) = (60, 10);
     let view = |first: usize| {
         let data =

@@ -1,19 +1,18 @@
-//! Codes for things that come later: those there are stay as they are
+//! Adds codes for new things to a codebook; existing codes stay unchanged
 //! (docs/internals/method.md#photos-added-later).
 use super::{CodeEntry, EncodedLevel, SAME_EMBEDDING, assert_bijection, build, min_chord, spread};
 use crate::Result;
 use crate::math::{Random, dot};
 use crate::scene::Codebook;
 
-/// Random directions tried for a code: of 16 numbers, with 200 codes, ten times as many find a
-/// place 2 % farther from the others.
+/// Random directions tried for a code. With 200 codes of length 16, ten times as many give a code 2
+/// % farther from the others.
 const TRIED: usize = 4000;
-/// Steps that then move the best of them away from its nearest neighbours.
+/// Steps of the local random search from the best of them.
 const STEPS: usize = 400;
 
-/// The codebook with a code for every entry: that of an embedding which no text query can tell from
-/// its own, else a new one as far from all others as can be found. `dim` is the length of the codes
-/// where there are none yet.
+/// Returns the codebook with a code for every entry: the code of an embedding with a cosine above
+/// 0.9995, else a new code far from all others. `dim` is the code length if `book` is empty.
 pub fn append(book: &Codebook, entries: &[CodeEntry], dim: usize, seed: u64) -> Result<EncodedLevel> {
     if book.is_empty() {
         return build(entries, dim, seed);
@@ -31,8 +30,8 @@ pub fn append(book: &Codebook, entries: &[CodeEntry], dim: usize, seed: u64) -> 
                 code
             }
             None => {
-                let free = farthest(&out.codes, out.code_dim, &mut random);
-                out.codes.extend(free);
+                let code = farthest(&out.codes, out.code_dim, &mut random);
+                out.codes.extend(code);
                 out.embeddings.extend_from_slice(&entry.embedding);
                 out.weights.push(entry.weight.max(1.0) as f32);
                 out.members.push(entry.members.clone());
@@ -48,39 +47,50 @@ pub fn append(book: &Codebook, entries: &[CodeEntry], dim: usize, seed: u64) -> 
     Ok(EncodedLevel { codebook: out, code_of })
 }
 
-/// A unit vector whose nearest of the codes is as far away as random search finds.
+/// Finds a unit vector far from all codes by random search.
 fn farthest(codes: &[f32], dim: usize, random: &mut Random) -> Vec<f32> {
-    let cosine = |v: &[f64]| {
-        let with = |row: &[f32]| row.iter().zip(v).map(|(c, x)| f64::from(*c) * x).sum::<f64>();
-        codes.chunks_exact(dim).map(with).fold(-1.0, f64::max)
-    };
     let axis = |k: usize| (0..dim).map(|i| if i == k { 1.0 } else { 0.0 }).collect::<Vec<f64>>();
-    let mut best = axis(0);
-    let mut nearest = cosine(&best);
-    let consider = |v: Vec<f64>, best: &mut Vec<f64>, nearest: &mut f64| {
-        let own = cosine(&v);
-        if own < *nearest {
-            (*best, *nearest) = (v, own);
-        }
-    };
-    // While there are fewer codes than numbers they are axes, and the next axis keeps mixtures of
-    // two from reading as a third.
-    (1..dim).for_each(|k| consider(axis(k), &mut best, &mut nearest));
-    if nearest <= 0.0 {
-        return best.iter().map(|v| *v as f32).collect();
+    let mut best = Candidate::new(axis(0), codes);
+    // With fewer codes than dimensions all codes are axes, and with another axis a mix of two codes
+    // never decodes to a third.
+    (1..dim).for_each(|k| best.improve(axis(k), codes));
+    if best.cosine <= 0.0 {
+        return best.direction.iter().map(|v| *v as f32).collect();
     }
     for _ in 0..TRIED {
-        consider(spread::unit(random, dim), &mut best, &mut nearest);
+        best.improve(spread::unit(random, dim), codes);
     }
     for step in 0..STEPS {
         let length = 0.3 * (1.0 - step as f64 / STEPS as f64);
         let side = spread::unit(random, dim);
-        let mut moved: Vec<f64> = best.iter().zip(&side).map(|(b, s)| b + length * s).collect();
+        let mut moved: Vec<f64> = best.direction.iter().zip(&side).map(|(b, s)| b + length * s).collect();
         let norm = moved.iter().map(|v| v * v).sum::<f64>().sqrt();
         moved.iter_mut().for_each(|v| *v /= norm.max(1e-12));
-        consider(moved, &mut best, &mut nearest);
+        best.improve(moved, codes);
     }
-    best.iter().map(|v| *v as f32).collect()
+    best.direction.iter().map(|v| *v as f32).collect()
+}
+
+/// A unit vector and its largest cosine to a code.
+struct Candidate {
+    direction: Vec<f64>,
+    cosine: f64,
+}
+
+impl Candidate {
+    fn new(direction: Vec<f64>, codes: &[f32]) -> Candidate {
+        let cosine_to = |row: &[f32]| row.iter().zip(&direction).map(|(c, x)| f64::from(*c) * x).sum::<f64>();
+        let cosine = codes.chunks_exact(direction.len()).map(cosine_to).fold(-1.0, f64::max);
+        Candidate { direction, cosine }
+    }
+
+    /// Replaces the vector by another one that is farther from the codes.
+    fn improve(&mut self, direction: Vec<f64>, codes: &[f32]) {
+        let other = Candidate::new(direction, codes);
+        if other.cosine < self.cosine {
+            *self = other;
+        }
+    }
 }
 
 #[cfg(test)]
@@ -94,13 +104,13 @@ mod tests {
     }
 
     #[test]
-    fn old_codes_stay_and_new_ones_keep_away_from_them() {
+    fn append_keeps_codes_and_separates_new() {
         let mut random = Random::new(4);
         for (old, new) in [(3, 4), (60, 20)] {
             let entries: Vec<CodeEntry> = (0..old + new).map(|k| entry(&mut random, k)).collect();
             let book = build(&entries[..old], 16, 1).unwrap().codebook;
             let mut later = entries[old..].to_vec();
-            // One that is an old thing once more.
+            // A duplicate of an existing entry.
             later.push(CodeEntry { members: vec![MaskId::new(5, 9)], ..entries[1].clone() });
             let joined = append(&book, &later, 16, 1).unwrap();
             let (codes, of) = (&joined.codebook, &joined.code_of);
@@ -117,7 +127,7 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_without_codes_on_a_level_gets_its_first_ones() {
+    fn append_to_empty_book_equals_build() {
         let entries = [entry(&mut Random::new(2), 0)];
         assert_eq!(append(&Codebook::default(), &entries, 8, 0).unwrap(), build(&entries, 8, 0).unwrap());
     }

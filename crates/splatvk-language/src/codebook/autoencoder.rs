@@ -1,12 +1,12 @@
 //! The scene autoencoder of LangSplat (Qin et al. 2024, docs/internals/method.md#other-codebooks)
-//! as another way to make a codebook, so that a comparison with the bijection changes nothing else.
+//! as an alternative codebook, for comparison with the bijection.
 //!
 //! An encoder D → 3 and a decoder 3 → D are trained on the scene's features. Splats carry points of
-//! the unit sphere, and a rendered point means whatever the decoder makes of it. The sphere is
+//! the unit sphere, and the decoder maps a rendered point to an embedding. The decoder is
 //! tabulated: the codebook is a lattice of [`LATTICE`] directions, at most 3.4° from any point,
-//! 1.7° on average, each with its decoded embedding. The decoder itself errs by far more, and the
-//! rest of the engine sees an ordinary codebook.
-use super::network::{Adam, Network, Step};
+//! 1.7° on average, each with its decoded embedding. The error of the decoder is far larger, and
+//! the rest of the engine uses an ordinary codebook.
+use super::network::{Adam, Mode, Network};
 use super::{CodeEntry, EncodedLevel, min_chord};
 use crate::math::Random;
 use crate::progress::Progress;
@@ -14,7 +14,7 @@ use crate::scene::Codebook;
 use crate::{Error, Result};
 use nalgebra::DMatrix;
 
-/// Directions of the table.
+/// Number of directions in the table.
 const LATTICE: usize = 2048;
 /// Published schedule.
 const EPOCHS: usize = 100;
@@ -27,11 +27,11 @@ const COSINE_WEIGHT: f32 = 1e-3;
 const ENCODER: [usize; 5] = [256, 128, 64, 32, 3];
 const DECODER: [usize; 6] = [16, 32, 64, 128, 256, 256];
 
-/// The trained pair and how well it restores its training data.
+/// Trained encoder and decoder.
 pub(crate) struct Autoencoder {
     encoder: Network,
     decoder: Network,
-    /// Mean cosine of features and their restoration.
+    /// Mean cosine of the training features and their reconstruction.
     pub cosine: f64,
 }
 
@@ -79,16 +79,16 @@ impl Autoencoder {
         let mut order: Vec<usize> = (0..count).collect();
         let batch = BATCH.min(count);
         let steps = (EPOCHS * count.div_ceil(batch)).max(least_steps);
-        let (mut done, mut at) = (0, count);
+        let (mut done, mut start) = (0, count);
         while done < steps {
             progress.check()?;
-            if at + batch > count {
+            if start + batch > count {
                 random.shuffle(&mut order);
-                at = 0;
+                start = 0;
             }
-            let rows = &order[at..at + batch];
+            let rows = &order[start..start + batch];
             let x = DMatrix::from_fn(dim, batch, |r, c| features[rows[c] * dim + r]);
-            at += batch;
+            start += batch;
             done += 1;
             adam.tick();
             this.step(&x, &mut adam)?;
@@ -100,11 +100,11 @@ impl Autoencoder {
         Ok(this)
     }
 
-    /// One step of Adam on a batch, columns.
+    /// One step of Adam on a batch of columns.
     fn step(&mut self, x: &DMatrix<f32>, adam: &mut Adam) -> Result<()> {
-        let inner = self.encoder.forward(x, Step::Train);
+        let inner = self.encoder.forward(x, Mode::Train);
         let (code, code_norms) = unit_columns(inner.output());
-        let outer = self.decoder.forward(&code, Step::Train);
+        let outer = self.decoder.forward(&code, Mode::Train);
         let (y, norms) = unit_columns(outer.output());
         let (_, gradient) = loss(&y, x);
         let gradient = unit_backward(&y, &norms, &gradient);
@@ -120,12 +120,12 @@ impl Autoencoder {
 
     /// [3, N] unit columns.
     pub fn encode(&self, x: &DMatrix<f32>) -> DMatrix<f32> {
-        unit_columns(self.encoder.forward(x, Step::Use).output()).0
+        unit_columns(self.encoder.forward(x, Mode::Infer).output()).0
     }
 
     /// [D, N] unit columns.
     pub fn decode(&self, code: &DMatrix<f32>) -> DMatrix<f32> {
-        unit_columns(self.decoder.forward(code, Step::Use).output()).0
+        unit_columns(self.decoder.forward(code, Mode::Infer).output()).0
     }
 }
 
@@ -140,13 +140,14 @@ fn loss(y: &DMatrix<f32>, x: &DMatrix<f32>) -> (f32, DMatrix<f32>) {
 
 /// Points of a Fibonacci lattice on the unit sphere, [LATTICE, 3].
 fn lattice() -> Vec<f32> {
+    (0..LATTICE).flat_map(lattice_point).collect()
+}
+
+fn lattice_point(k: usize) -> [f32; 3] {
     let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
-    let point = |k: usize| {
-        let z = 1.0 - (2 * k + 1) as f64 / LATTICE as f64;
-        let (r, angle) = ((1.0 - z * z).sqrt(), golden * k as f64);
-        [r * angle.cos(), r * angle.sin(), z].map(|v| v as f32)
-    };
-    (0..LATTICE).flat_map(point).collect()
+    let z = 1.0 - (2 * k + 1) as f64 / LATTICE as f64;
+    let (r, angle) = ((1.0 - z * z).sqrt(), golden * k as f64);
+    [r * angle.cos(), r * angle.sin(), z].map(|v| v as f32)
 }
 
 /// One codebook per level, all over the same lattice; every entry gets the direction nearest to its
@@ -163,31 +164,33 @@ pub(crate) fn build(
     let model = Autoencoder::train(&all, dim, least_steps, seed, progress)?;
     let codes = lattice();
     let embeddings = model.decode(&DMatrix::from_column_slice(3, LATTICE, &codes));
-    let chord = min_chord(&codes, 3);
-    let level = |entries: &Vec<CodeEntry>| {
-        if entries.is_empty() {
-            return EncodedLevel::default();
-        }
-        let mut codebook = Codebook {
-            embedding_dim: dim,
-            code_dim: 3,
-            embeddings: embeddings.as_slice().to_vec(),
-            codes: codes.clone(),
-            weights: vec![0.0; LATTICE],
-            members: vec![Vec::new(); LATTICE],
-            min_chord: chord,
-        };
-        let mut code_of = Vec::with_capacity(entries.len());
-        for entry in entries {
-            let code = model.encode(&DMatrix::from_column_slice(dim, 1, &entry.embedding));
-            let k = codebook.decode(code.as_slice()).unwrap_or(0);
-            codebook.weights[k] += entry.weight as f32;
-            codebook.members[k].extend_from_slice(&entry.members);
-            code_of.push(k as u32);
-        }
-        EncodedLevel { codebook, code_of }
+    let table = Codebook {
+        embedding_dim: dim,
+        code_dim: 3,
+        embeddings: embeddings.as_slice().to_vec(),
+        min_chord: min_chord(&codes, 3),
+        codes,
+        weights: vec![0.0; LATTICE],
+        members: vec![Vec::new(); LATTICE],
     };
-    Ok((levels.iter().map(level).collect(), model.cosine))
+    Ok((levels.iter().map(|entries| encode_level(&model, &table, entries)).collect(), model.cosine))
+}
+
+/// Assigns entries to the directions of `table`, which has no weights and members yet.
+fn encode_level(model: &Autoencoder, table: &Codebook, entries: &[CodeEntry]) -> EncodedLevel {
+    if entries.is_empty() {
+        return EncodedLevel::default();
+    }
+    let mut codebook = table.clone();
+    let mut code_of = Vec::with_capacity(entries.len());
+    for entry in entries {
+        let code = model.encode(&DMatrix::from_column_slice(table.embedding_dim, 1, &entry.embedding));
+        let k = codebook.decode(code.as_slice()).unwrap_or(0);
+        codebook.weights[k] += entry.weight as f32;
+        codebook.members[k].extend_from_slice(&entry.members);
+        code_of.push(k as u32);
+    }
+    EncodedLevel { codebook, code_of }
 }
 
 #[cfg(test)]
@@ -205,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn the_loss_gradient_is_its_derivative() {
+    fn loss_gradient_matches_central_differences() {
         let (x, y) = (unit_rows(3, 6, 1), unit_rows(3, 6, 2));
         let x = DMatrix::from_column_slice(6, 3, &x);
         let y = DMatrix::from_column_slice(6, 3, &y);
@@ -226,15 +229,15 @@ mod tests {
 
     #[test]
     #[ignore = "takes long: tools/test-long"]
-    fn few_features_are_restored_and_many_are_not() {
+    fn autoencoder_restores_few_features_only() {
         let few = Autoencoder::train(&unit_rows(4, 32, 1000), 32, 2000, 0, &Silent).unwrap();
         assert!(few.cosine > 0.95, "{}", few.cosine);
-        // 300 unrelated directions do not fit on a sphere: that is what the bijection avoids
+        // 300 unrelated directions do not fit on a sphere, which the bijection avoids
         let many = Autoencoder::train(&unit_rows(300, 32, 1000), 32, 2000, 0, &Silent).unwrap();
         assert!(many.cosine < 0.8 && many.cosine > 0.2, "{}", many.cosine);
     }
 
-    /// Asks to stop at the third question.
+    /// Cancels at the third check.
     #[derive(Default)]
     struct StopAtThree(AtomicUsize);
 
@@ -249,7 +252,7 @@ mod tests {
     }
 
     #[test]
-    fn training_stops_between_two_steps() {
+    fn train_cancelled_stops_between_steps() {
         let progress = StopAtThree::default();
         let stopped = Autoencoder::train(&unit_rows(4, 32, 1000), 32, 2000, 0, &progress);
         assert!(matches!(stopped, Err(Error::Cancelled)));
@@ -257,7 +260,7 @@ mod tests {
     }
 
     #[test]
-    fn the_lattice_covers_the_sphere_and_codes_decode_to_the_decoder() {
+    fn lattice_covers_sphere_and_decodes() {
         let codes = lattice();
         let probe = unit_rows(500, 3, 1001);
         for p in probe.chunks_exact(3) {

@@ -14,7 +14,7 @@ use crate::scene::{Codebook, MaskId};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
-/// Embeddings with a larger cosine cannot be told apart by any text query and share a code
+/// Cosine above which no text query separates two embeddings, so that they share a code
 /// (docs/internals/method.md#code-construction, step 1).
 const SAME_EMBEDDING: f64 = 0.9995;
 
@@ -27,7 +27,7 @@ const MIN_CHORD: f32 = 0.02;
 pub struct CodeEntry {
     /// [D] unit vector.
     pub embedding: Vec<f32>,
-    /// Pixels.
+    /// Σ pixels × quality of the masks.
     pub weight: f64,
     /// The masks that share it.
     pub members: Vec<MaskId>,
@@ -43,7 +43,8 @@ pub struct EncodedLevel {
 }
 
 /// Builds the codebook of one level: merges indistinguishable embeddings, gives each of the K that
-/// remain a unit code of length `dim`, and proves that decoding inverts encoding, also under noise.
+/// remain a unit code of length `dim`, and verifies that decoding inverts encoding, also under
+/// noise.
 pub fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> Result<EncodedLevel> {
     if dim == 0 {
         return Err(Error::input("the feature dimension must be at least 1"));
@@ -101,7 +102,8 @@ fn deduplicate(entries: &[CodeEntry]) -> (Vec<CodeEntry>, Vec<u32>) {
     (kept, code_of)
 }
 
-/// `c_k = e_k`: with no more codes than dimensions a mix of two codes is never nearest to a third.
+/// `c_k = e_k`: with at most as many codes as dimensions, a mix of two codes is never nearest to a
+/// third.
 fn one_hot(count: usize, dim: usize) -> Vec<f32> {
     (0..count * dim).map(|i| if i / dim == i % dim { 1.0 } else { 0.0 }).collect()
 }
@@ -109,13 +111,14 @@ fn one_hot(count: usize, dim: usize) -> Vec<f32> {
 /// Smallest distance between two codes; 2 (the diameter) for fewer than two codes.
 pub fn min_chord(codes: &[f32], dim: usize) -> f32 {
     let rows: Vec<&[f32]> = codes.chunks_exact(dim).collect();
-    let nearest = |k: usize| {
-        let others = rows[k + 1..].iter();
-        others
-            .map(|o| rows[k].iter().zip(*o).map(|(a, b)| (a - b) * (a - b)).sum::<f32>())
-            .fold(4.0, f32::min)
-    };
-    (0..rows.len()).into_par_iter().map(nearest).reduce(|| 4.0, f32::min).sqrt()
+    let nearest = (0..rows.len()).into_par_iter().map(|k| squared_chord(rows[k], &rows[k + 1..]));
+    nearest.reduce(|| 4.0, f32::min).sqrt()
+}
+
+/// Smallest squared distance of a code to some others, at most 4.
+fn squared_chord(code: &[f32], others: &[&[f32]]) -> f32 {
+    let squared = |other: &[f32]| code.iter().zip(other).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
+    others.iter().map(|other| squared(other)).fold(4.0, f32::min)
 }
 
 /// The bijection guarantee: codes are distinct, decode(encode(k)) = k, also with uniform noise of

@@ -8,13 +8,13 @@ const NORM_EPSILON: f32 = 1e-5;
 /// Weight of a new batch in the running statistics (the published default).
 const NORM_MOMENTUM: f32 = 0.1;
 
-/// Whether a pass gathers batch statistics.
+/// Mode of the batch normalisation.
 #[derive(Clone, Copy, PartialEq)]
-pub(super) enum Step {
-    /// Normalises by the batch and keeps what the gradient needs.
+pub(super) enum Mode {
+    /// Normalises by the statistics of the batch.
     Train,
     /// Normalises by the running statistics.
-    Use,
+    Infer,
 }
 
 /// Adam (Kingma & Ba 2015) with the usual β and ε.
@@ -27,7 +27,7 @@ impl Adam {
     pub fn new(rate: f64) -> Self {
         Adam { rate, steps: 0 }
     }
-    /// A new batch begins.
+    /// Counts a batch.
     pub fn tick(&mut self) {
         self.steps += 1;
     }
@@ -77,16 +77,16 @@ struct Layer {
     bias: Parameter,
 }
 
-/// What one layer saw.
+/// Values of a layer's forward pass that its gradient needs.
 struct Trace {
     /// Normalised input before scale and shift, mean and deviation that it was normalised by.
     normalised: Option<(DMatrix<f32>, DVector<f32>, DVector<f32>)>,
-    /// What the weights multiplied.
+    /// Input of the linear map.
     input: DMatrix<f32>,
     output: DMatrix<f32>,
 }
 
-/// What a forward pass saw.
+/// Traces of a forward pass, one per layer.
 pub(super) struct Pass(Vec<Trace>);
 
 impl Pass {
@@ -126,11 +126,11 @@ impl Network {
         Network { layers }
     }
 
-    pub fn forward(&self, x: &DMatrix<f32>, step: Step) -> Pass {
+    pub fn forward(&self, x: &DMatrix<f32>, mode: Mode) -> Pass {
         let mut traces: Vec<Trace> = Vec::with_capacity(self.layers.len());
         for layer in &self.layers {
             let input = traces.last().map_or(x, |t| &t.output);
-            let trace = layer.forward(input, step);
+            let trace = layer.forward(input, mode);
             traces.push(trace);
         }
         Pass(traces)
@@ -147,12 +147,12 @@ impl Network {
 }
 
 impl Layer {
-    fn forward(&self, x: &DMatrix<f32>, step: Step) -> Trace {
+    fn forward(&self, x: &DMatrix<f32>, mode: Mode) -> Trace {
         let (mut input, mut normalised) = (x.clone(), None);
         if let Some(norm) = &self.norm {
-            let (mean, variance) = match step {
-                Step::Train => (x.column_mean(), x.column_variance()),
-                Step::Use => (norm.mean.clone(), norm.variance.clone()),
+            let (mean, variance) = match mode {
+                Mode::Train => (x.column_mean(), x.column_variance()),
+                Mode::Infer => (norm.mean.clone(), norm.variance.clone()),
             };
             let deviation = variance.map(|v| (v + NORM_EPSILON).sqrt());
             for mut column in input.column_iter_mut() {
@@ -190,7 +190,7 @@ impl Layer {
         }
         match (&mut self.norm, &trace.normalised) {
             (Some(norm), Some((x, mean, deviation))) => {
-                norm.remember(mean, deviation);
+                norm.update_running(mean, deviation);
                 norm.backward(x, deviation, by_input, adam)
             }
             _ => by_input,
@@ -200,7 +200,7 @@ impl Layer {
 
 impl Norm {
     /// Moves the running statistics towards those of a batch.
-    fn remember(&mut self, mean: &DVector<f32>, deviation: &DVector<f32>) {
+    fn update_running(&mut self, mean: &DVector<f32>, deviation: &DVector<f32>) {
         let variance = deviation.map(|d| d * d - NORM_EPSILON);
         self.mean.axpy(NORM_MOMENTUM, mean, 1.0 - NORM_MOMENTUM);
         self.variance.axpy(NORM_MOMENTUM, &variance, 1.0 - NORM_MOMENTUM);
@@ -235,13 +235,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_input_gradient_is_the_derivative_through_normalisation_and_relu() {
+    fn backward_input_gradient_matches_differences() {
         let mut random = Random::new(1000);
         let mut network = Network::new(4, &[6, 5, 2], true, &mut random);
         let mut draw = |r: usize, c: usize| DMatrix::from_fn(r, c, |_, _| random.normal() as f32);
         let (x, upstream) = (draw(4, 7), draw(2, 7));
         let value = |network: &Network, x: &DMatrix<f32>| {
-            network.forward(x, Step::Train).output().component_mul(&upstream).sum()
+            network.forward(x, Mode::Train).output().component_mul(&upstream).sum()
         };
         let numeric: Vec<f32> = (0..x.len())
             .map(|k| {
@@ -251,7 +251,7 @@ mod tests {
                 (value(&network, &a) - value(&network, &b)) / 2e-3
             })
             .collect();
-        let pass = network.forward(&x, Step::Train);
+        let pass = network.forward(&x, Mode::Train);
         // a rate of zero: nothing moves
         let mut adam = Adam::new(0.0);
         adam.tick();
@@ -264,20 +264,20 @@ mod tests {
     }
 
     #[test]
-    fn adam_reaches_a_linear_map() {
+    fn adam_fits_linear_map() {
         let mut random = Random::new(1001);
         let mut network = Network::new(3, &[2], false, &mut random);
         let truth = DMatrix::from_row_slice(2, 3, &[1.0, -2.0, 0.5, 0.0, 1.0, 1.0]);
         let mut adam = Adam::new(0.05);
         for _ in 0..600 {
             let x = DMatrix::from_fn(3, 16, |_, _| random.normal() as f32);
-            let pass = network.forward(&x, Step::Train);
+            let pass = network.forward(&x, Mode::Train);
             let gradient = (pass.output() - &truth * &x) / 16.0;
             adam.tick();
             network.backward(&pass, gradient, &adam);
         }
         let probe = DMatrix::identity(3, 3);
-        let out = network.forward(&probe, Step::Use);
+        let out = network.forward(&probe, Mode::Infer);
         assert!((out.output() - &truth * &probe).amax() < 0.05, "{}", out.output());
     }
 }

@@ -1,6 +1,5 @@
-//! The quantised feature codebook of LEGaussians (Shi et al. 2024) as another way to make a
-//! codebook: at most 128 mean features stand for all, and what splats carry is free until an index
-//! head is trained on it.
+//! The quantised feature codebook of LEGaussians (Shi et al. 2024) as an alternative codebook: at
+//! most 128 mean features stand for all. Codes are random until an index head is trained on them.
 use super::{CodeEntry, EncodedLevel, min_chord};
 use crate::dir::normalise_rows;
 use crate::math::Random;
@@ -25,9 +24,9 @@ fn cluster(entries: &[CodeEntry], count: usize) -> (Vec<Vec<f32>>, Vec<usize>) {
         nearest.iter_mut().zip(entries).for_each(|(n, e)| *n = n.max(dot(&e.embedding, &centre)));
         centres.push(centre);
     }
-    let mut of = vec![0; entries.len()];
+    let mut centre_of = vec![0; entries.len()];
     for _ in 0..ROUNDS {
-        for (slot, e) in of.iter_mut().zip(entries) {
+        for (slot, e) in centre_of.iter_mut().zip(entries) {
             let best = (0..centres.len()).max_by(|&a, &b| {
                 dot(&e.embedding, &centres[a]).total_cmp(&dot(&e.embedding, &centres[b])).then(b.cmp(&a))
             });
@@ -35,7 +34,7 @@ fn cluster(entries: &[CodeEntry], count: usize) -> (Vec<Vec<f32>>, Vec<usize>) {
         }
         for (k, centre) in centres.iter_mut().enumerate() {
             let mut sum = vec![0.0f32; centre.len()];
-            for (e, _) in entries.iter().zip(&of).filter(|(_, c)| **c == k) {
+            for (e, _) in entries.iter().zip(&centre_of).filter(|(_, c)| **c == k) {
                 sum.iter_mut().zip(&e.embedding).for_each(|(s, v)| *s += e.weight as f32 * v);
             }
             let dim = sum.len();
@@ -46,15 +45,15 @@ fn cluster(entries: &[CodeEntry], count: usize) -> (Vec<Vec<f32>>, Vec<usize>) {
             }
         }
     }
-    (centres, of)
+    (centres, centre_of)
 }
 
-/// The codebook of one level: means of alike features, each with a random direction to start from.
+/// The codebook of one level: means of similar features, each with a random direction as code.
 pub(crate) fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> EncodedLevel {
     if entries.is_empty() || dim == 0 {
         return EncodedLevel::default();
     }
-    let (centres, of) = cluster(entries, ENTRIES.min(entries.len()));
+    let (centres, centre_of) = cluster(entries, ENTRIES.min(entries.len()));
     let mut random = Random::new(seed ^ 0x1e6);
     let mut codes: Vec<f32> = (0..centres.len() * dim).map(|_| random.normal() as f32).collect();
     normalise_rows(&mut codes, dim);
@@ -67,11 +66,11 @@ pub(crate) fn build(entries: &[CodeEntry], dim: usize, seed: u64) -> EncodedLeve
         weights: vec![0.0; centres.len()],
         members: vec![Vec::new(); centres.len()],
     };
-    for (e, &k) in entries.iter().zip(&of) {
+    for (e, &k) in entries.iter().zip(&centre_of) {
         codebook.weights[k] += e.weight as f32;
         codebook.members[k].extend_from_slice(&e.members);
     }
-    EncodedLevel { codebook, code_of: of.into_iter().map(|k| k as u32).collect() }
+    EncodedLevel { codebook, code_of: centre_of.into_iter().map(|k| k as u32).collect() }
 }
 
 #[cfg(test)]
@@ -87,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn alike_features_share_an_entry_and_few_stay_themselves() {
+    fn quantise_merges_similar_features() {
         let mut random = Random::new(1000);
         let mut entries = Vec::new();
         for k in 0..150 {

@@ -6,8 +6,8 @@ use rayon::prelude::*;
 /// Gradient steps; the minimum distance no longer grows after about 200 on 50 to 600 codes.
 const STEPS: usize = 300;
 
-/// How many nearest embeddings pull at each code, and how strongly against a mean repulsion of 1:
-/// enough to keep neighbours in meaning near each other, too little to bring codes together.
+/// Number of nearest embeddings that attract each code, and strength of the attraction beside a
+/// repulsion of 1: it keeps codes of related meaning near each other but does not join them.
 const NEIGHBOURS: usize = 3;
 const ATTRACTION: f64 = 0.02;
 
@@ -27,7 +27,7 @@ fn normalise(v: &mut [f64]) {
     }
 }
 
-/// Minimises `Σ 1/‖y_k − y_l‖^p` plus a weak pull between neighbours in meaning, by projected
+/// Minimises `Σ 1/‖y_k − y_l‖^p` plus a weak attraction between nearest embeddings, by projected
 /// gradient steps with a shrinking step length; returns the layout with the largest minimum
 /// distance seen, [K, dim] unit rows.
 pub(super) fn spread(
@@ -54,7 +54,7 @@ pub(super) fn spread(
     let power = if dim < 6 { dim as i32 } else { 4 };
     // typical spacing of K points on the sphere: the natural step length
     let spacing = 2.0 / (count as f64).powf(1.0 / (dim - 1) as f64);
-    let (mut best, mut best_chord) = (y.clone(), chord(&y, dim));
+    let (mut best, mut best_chord) = (y.clone(), min_chord(&y, dim));
     for step in 0..STEPS {
         let length = 0.2 * spacing * (1.0 - step as f64 / STEPS as f64) + 1e-4 * spacing;
         let previous = y.clone();
@@ -73,9 +73,9 @@ pub(super) fn spread(
             }
             normalise(row);
         });
-        let now = chord(&y, dim);
-        if now > best_chord {
-            (best, best_chord) = (y.clone(), now);
+        let chord = min_chord(&y, dim);
+        if chord > best_chord {
+            (best, best_chord) = (y.clone(), chord);
         }
     }
     best.iter().map(|&v| v as f32).collect()
@@ -84,23 +84,23 @@ pub(super) fn spread(
 /// `Σ_l (y_k − y_l)/‖y_k − y_l‖^(p+2)`, the descent direction of the energy.
 fn repulsion(y: &[f64], k: usize, dim: usize, power: i32) -> Vec<f64> {
     let mut force = vec![0.0; dim];
-    let me = &y[k * dim..(k + 1) * dim];
+    let own = &y[k * dim..(k + 1) * dim];
     for (l, other) in y.chunks_exact(dim).enumerate() {
         if l == k {
             continue;
         }
-        let square: f64 = me.iter().zip(other).map(|(a, b)| (a - b) * (a - b)).sum();
+        let square: f64 = own.iter().zip(other).map(|(a, b)| (a - b) * (a - b)).sum();
         // 1e-12 keeps coincident points finite; they were nudged apart before
         let scale = square.max(1e-12).powi(-(power + 2) / 2);
         for c in 0..dim {
-            force[c] += scale * (me[c] - other[c]);
+            force[c] += scale * (own[c] - other[c]);
         }
     }
     force
 }
 
-/// Unit length: with p = 4 forces span many decades, and a fixed step length converges where a
-/// scaled one explodes.
+/// Scales a force to unit length: with p = 4 forces span many decades; a fixed step length
+/// converges and a scaled one diverges.
 fn normalise_force(force: &mut [f64]) {
     let norm = force.iter().map(|x| x * x).sum::<f64>().sqrt();
     if norm > 0.0 {
@@ -108,15 +108,16 @@ fn normalise_force(force: &mut [f64]) {
     }
 }
 
-fn chord(y: &[f64], dim: usize) -> f64 {
+/// [`super::min_chord`] in f64.
+fn min_chord(y: &[f64], dim: usize) -> f64 {
     let rows: Vec<&[f64]> = y.chunks_exact(dim).collect();
-    let nearest = |k: usize| {
-        let others = rows[k + 1..].iter();
-        others
-            .map(|o| rows[k].iter().zip(*o).map(|(a, b)| (a - b) * (a - b)).sum::<f64>())
-            .fold(4.0, f64::min)
-    };
-    (0..rows.len()).into_par_iter().map(nearest).reduce(|| 4.0, f64::min).sqrt()
+    let nearest = (0..rows.len()).into_par_iter().map(|k| squared_chord(rows[k], &rows[k + 1..]));
+    nearest.reduce(|| 4.0, f64::min).sqrt()
+}
+
+fn squared_chord(code: &[f64], others: &[&[f64]]) -> f64 {
+    let squared = |other: &[f64]| code.iter().zip(other).map(|(a, b)| (a - b) * (a - b)).sum::<f64>();
+    others.iter().map(|other| squared(other)).fold(4.0, f64::min)
 }
 
 /// The most similar embeddings of each embedding.

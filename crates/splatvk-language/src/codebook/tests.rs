@@ -14,7 +14,7 @@ fn entries(count: usize, dim: usize, seed: u64) -> Vec<CodeEntry> {
 }
 
 #[test]
-fn every_count_round_trips_under_noise() {
+fn build_round_trips_every_count() {
     for (count, dim) in [(1, 3), (2, 3), (3, 3), (16, 16), (17, 16), (120, 3), (200, 16)] {
         let built = build(&entries(count, 64, 5), dim, 1).unwrap();
         let book = &built.codebook;
@@ -28,7 +28,7 @@ fn every_count_round_trips_under_noise() {
 }
 
 #[test]
-fn spreading_comes_near_the_best_known_distances() {
+fn spread_approaches_best_known_distances() {
     // Best known: about 3.09/√K on the Fibonacci lattice for d = 3
     // (docs/internals/method.md#code-construction); measured .81 for 200 in d = 8.
     let three = build(&entries(200, 64, 9), 3, 1).unwrap().codebook.min_chord;
@@ -38,7 +38,7 @@ fn spreading_comes_near_the_best_known_distances() {
 }
 
 #[test]
-fn duplicates_share_a_code_and_keep_their_members() {
+fn build_duplicates_share_one_code() {
     let mut list = entries(4, 32, 2);
     list[3].embedding = list[1].embedding.clone();
     let built = build(&list, 16, 0).unwrap();
@@ -50,19 +50,19 @@ fn duplicates_share_a_code_and_keep_their_members() {
 }
 
 #[test]
-fn too_many_codes_for_the_dimension_is_an_error() {
+fn build_too_many_codes_fails() {
     let text = build(&entries(3, 32, 4), 1, 0).unwrap_err().to_string();
     assert!(text.contains("--feature-dim"), "{text}");
 }
 
 #[test]
-fn runs_are_identical() {
+fn build_is_deterministic() {
     let list = entries(60, 48, 3);
     assert_eq!(build(&list, 8, 7).unwrap(), build(&list, 8, 7).unwrap());
 }
 
 #[test]
-fn a_gradient_between_two_codes_switches_once_when_codes_are_axes() {
+fn one_hot_codes_switch_once_between() {
     let built = build(&entries(12, 48, 3), 16, 7).unwrap();
     let book = &built.codebook;
     let (a, b) = (&book.codes[2 * 16..3 * 16], &book.codes[7 * 16..8 * 16]);
@@ -79,7 +79,7 @@ fn a_gradient_between_two_codes_switches_once_when_codes_are_axes() {
 }
 
 #[test]
-fn pca_agrees_with_a_full_decomposition() {
+fn pca_matches_svd() {
     let list = entries(40, 20, 8);
     let rows: Vec<f32> = list.iter().flat_map(|e| e.embedding.clone()).collect();
     let weights: Vec<f64> = list.iter().map(|e| e.weight).collect();
@@ -112,6 +112,6 @@ fn pca_agrees_with_a_full_decomposition() {
 
 #[test]
 #[ignore = "a thousand codes take tens of seconds on two cores"]
-fn a_thousand_codes_stay_distinct() {
+fn build_thousand_codes_stay_distinct() {
     assert!(build(&entries(1000, 64, 5), 16, 1).unwrap().codebook.min_chord > 0.3);
 }

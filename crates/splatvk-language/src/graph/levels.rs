@@ -1,9 +1,9 @@
 //! Three cuts of the merge tree.
 //!
-//! A fixed threshold cuts plain and printed things at different depths. What people call a thing is
-//! instead a node with a clear outline, so a level is the set of disjoint nodes with the largest
-//! total score (the rule by which HDBSCAN chooses clusters, Campello et al. 2013). Each level is
-//! cut by itself, so that what it holds does not hang on what a coarser one took.
+//! A fixed threshold cuts plain and printed things at different depths. Things are instead nodes
+//! with a clear outline: a level is the set of disjoint nodes with the largest total score (the
+//! rule by which HDBSCAN chooses clusters, Campello et al. 2013). Each level is cut independently
+//! of the others.
 use super::options::{Cues, GraphOptions};
 use super::tree::Tree;
 use crate::scene::Image;
@@ -16,26 +16,26 @@ const NONE: usize = usize::MAX;
 pub(super) fn cut(tree: &Tree, cues: &Cues, options: &GraphOptions) -> ViewMasks {
     let total = cues.labels.data.len() as f32;
     let roots: Vec<usize> = (0..tree.nodes.len()).filter(|&n| tree.nodes[n].parent == NONE).collect();
-    // the whole image is no thing
-    let starts: Vec<usize> = roots.iter().flat_map(|&r| inside(tree, r)).collect();
-    let level = |(&power, &share): (&f32, &f32)| {
-        let mut chosen = clearest(tree, &starts, share * total, |n| score(tree, n, power, options));
+    // the whole image is not a candidate
+    let starts: Vec<usize> = roots.iter().flat_map(|&r| children_of(tree, r)).collect();
+    let cut_level = |(&power, &share): (&f32, &f32)| {
+        let mut chosen = best_nodes(tree, &starts, share * total, |n| score(tree, n, power, options));
         if chosen.is_empty() {
-            // nothing stands out: the image is one thing
+            // without any outline the image is one mask
             chosen.clone_from(&roots);
         }
         paint(tree, cues, &chosen)
     };
-    ViewMasks { levels: options.area_powers.iter().zip(&options.min_masks).map(level).collect() }
+    ViewMasks { levels: options.area_powers.iter().zip(&options.min_masks).map(cut_level).collect() }
 }
 
 /// The two halves of a node; none for a leaf.
-fn inside(tree: &Tree, node: usize) -> Vec<usize> {
+fn children_of(tree: &Tree, node: usize) -> Vec<usize> {
     tree.nodes[node].children.map_or(Vec::new(), |(a, b)| vec![a, b])
 }
 
-/// How clear the outline of a node is, weighed by its size. The share of costs over which it stays
-/// as it is, as in HDBSCAN, adds nothing to that: see `docs/internals/method.md#graph-masks`.
+/// Strength of a node's outline, weighted by its size. The range of costs over which a node
+/// persists, as in HDBSCAN, adds nothing: see `docs/internals/method.md#graph-masks`.
 fn score(tree: &Tree, node: usize, area_power: f32, options: &GraphOptions) -> f32 {
     let r = &tree.nodes[node].region;
     let contour = r.contour / (r.perimeter - r.frame).max(1.0);
@@ -43,7 +43,7 @@ fn score(tree: &Tree, node: usize, area_power: f32, options: &GraphOptions) -> f
 }
 
 /// Disjoint nodes of at least `min_area` at or below `starts` with the largest total score.
-fn clearest(tree: &Tree, starts: &[usize], min_area: f32, score: impl Fn(usize) -> f32) -> Vec<usize> {
+fn best_nodes(tree: &Tree, starts: &[usize], min_area: f32, score: impl Fn(usize) -> f32) -> Vec<usize> {
     // children precede parents: one pass from the leaves up
     let mut best = vec![0.0f32; tree.nodes.len()];
     let mut own = vec![false; tree.nodes.len()];
@@ -59,15 +59,15 @@ fn clearest(tree: &Tree, starts: &[usize], min_area: f32, score: impl Fn(usize) 
         if own[n] {
             chosen.push(n);
         } else if best[n] > 0.0 {
-            stack.extend(inside(tree, n));
+            stack.extend(children_of(tree, n));
         }
     }
     chosen.sort_unstable();
     chosen
 }
 
-/// The chosen nodes as a label map; what none of them covers joins the neighbour it shares the
-/// longest border with.
+/// Paints the chosen nodes into a label map; an uncovered superpixel joins the neighbour with the
+/// longest common border.
 fn paint(tree: &Tree, cues: &Cues, chosen: &[usize]) -> LevelMasks {
     let mut mask_of = vec![NONE; tree.leaves];
     for (mask, &node) in chosen.iter().enumerate() {
@@ -76,7 +76,7 @@ fn paint(tree: &Tree, cues: &Cues, chosen: &[usize]) -> LevelMasks {
             if n < tree.leaves {
                 mask_of[n] = mask;
             }
-            stack.extend(inside(tree, n));
+            stack.extend(children_of(tree, n));
         }
     }
     let borders = leaf_borders(cues);
@@ -102,9 +102,9 @@ fn paint(tree: &Tree, cues: &Cues, chosen: &[usize]) -> LevelMasks {
             mask_of[leaf] = mask;
         }
     }
-    let value = |&l: &i32| if mask_of[l as usize] == NONE { -1 } else { mask_of[l as usize] as i32 };
+    let label = |&l: &i32| if mask_of[l as usize] == NONE { -1 } else { mask_of[l as usize] as i32 };
     let (width, height) = (cues.labels.width, cues.labels.height);
-    let labels = Image { width, height, data: cues.labels.data.iter().map(value).collect() };
+    let labels = Image { width, height, data: cues.labels.data.iter().map(label).collect() };
     LevelMasks { labels, quality: vec![1.0; chosen.len()], ..LevelMasks::default() }
 }
 
@@ -112,7 +112,7 @@ fn paint(tree: &Tree, cues: &Cues, chosen: &[usize]) -> LevelMasks {
 fn leaf_borders(cues: &Cues) -> Vec<BTreeMap<usize, u32>> {
     let labels = &cues.labels;
     let mut out = vec![BTreeMap::new(); cues.count];
-    let mut join = |p: usize, q: usize| {
+    let mut add_border = |p: usize, q: usize| {
         let (a, b) = (labels.data[p] as usize, labels.data[q] as usize);
         if a != b {
             *out[a].entry(b).or_insert(0) += 1;
@@ -123,10 +123,10 @@ fn leaf_borders(cues: &Cues) -> Vec<BTreeMap<usize, u32>> {
         for x in 0..labels.width {
             let p = y * labels.width + x;
             if x + 1 < labels.width {
-                join(p, p + 1);
+                add_border(p, p + 1);
             }
             if y + 1 < labels.height {
-                join(p, p + labels.width);
+                add_border(p, p + labels.width);
             }
         }
     }

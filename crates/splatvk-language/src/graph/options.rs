@@ -1,20 +1,22 @@
-//! What the masks depend on. Each constant states what the mean of four figures becomes with it
-//! changed, from 0.948: the best-of-three IoU and that with one level per object (`splatvk bench
-//! masks`), each on breakfast and on generated scenes (tuning sets,
+//! Parameters of the masks. The docs of each give the mean of four figures for other values; the
+//! defaults give 0.948. The figures are the best-of-three IoU and the IoU with one level per object
+//! (`splatvk bench masks`), each on breakfast and on generated scenes (tuning sets,
 //! `docs/internals/method.md#graph-masks`). Differences below 0.005 are noise.
 use crate::scene::Image;
 
-/// Blur before anything is compared, pixels. 0.940 with 0.8, Felzenszwalb and Huttenlocher's own.
+/// σ of the blur before superpixels, pixels. 0.8, the value of Felzenszwalb and Huttenlocher:
+/// 0.940.
 pub(super) const SMOOTHING: f32 = 0.5;
 
-/// Difference of mean colours that counts as 63 % of a certain one, Lab units: it is plain to see.
-/// 10: 0.946, 40: 0.944.
+/// Difference of mean colours with 63 % of the largest cost, Lab units: a plainly visible one. 10:
+/// 0.946, 40: 0.944.
 pub(super) const DIFFERENT: f32 = 20.0;
 
-/// Least difference, so that size and enclosure order the merges of equal regions, too.
+/// Smallest cost of a difference, so that size and enclosure also order the merges of equal
+/// regions.
 pub(super) const EQUAL: f32 = 1e-4;
 
-/// How an image is cut into masks.
+/// Options of the segmentation.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GraphOptions {
     /// Felzenszwalb–Huttenlocher scale of the superpixels, Lab units · pixels at 640 × 480. 5:
@@ -23,27 +25,27 @@ pub struct GraphOptions {
     /// Smallest superpixel, pixels at 640 × 480. 15: 0.949, but twice as many regions to merge; 60:
     /// 0.946.
     pub min_superpixel: f32,
-    /// A certain learned boundary between two pixels, Lab units of difference. 20: 0.946, 80:
-    /// 0.946.
+    /// Lab difference equivalent to a learned boundary of probability 1 between two pixels. 20:
+    /// 0.946, 80: 0.946.
     pub superpixel_edge: f32,
     /// Weight of the learned boundary in the cost of a merge, beside that of the colours; both lie
     /// in [0, 1]. 1: 0.946, 4: 0.944.
     pub edge: f32,
-    /// How much a full enclosure lowers the cost: what is printed on a thing joins it. 0: 0.929,
-    /// 0.2: 0.944, 0.6: 0.947.
+    /// Share by which full enclosure lowers the cost, so that print joins the thing under it. 0:
+    /// 0.929, 0.2: 0.944, 0.6: 0.947.
     pub enclosure: f32,
-    /// Exponent of the smaller region's share of the image; ½ makes that its width. 0.25: 0.947,
-    /// 0.75: 0.946.
+    /// Exponent of the smaller region's share of the image; ½ makes it a width. 0.25: 0.947, 0.75:
+    /// 0.946.
     pub size_power: f32,
     /// Exponent of a mask's mean contour strength in its score. 2.5: 0.933, 4: 0.947, 7: 0.946, 10:
     /// 0.939.
     pub contour_power: f32,
-    /// Exponents of its area on levels s, m, l: on s all masks count alike. Half of them: 0.946, ¾:
-    /// 0.948, 1½ times: 0.935.
+    /// Exponents of a mask's area in its score on levels s, m, l: on s the size has no weight. Half
+    /// of them: 0.946, ¾: 0.948, 1½ times: 0.935.
     pub area_powers: [f32; 3],
-    /// Smallest masks of levels s, m, l, share of the image, four times from level to level: below
-    /// it print and specks are masks, above it things are missed. Half of them: 0.920, 1½ times:
-    /// 0.931, twice: 0.905.
+    /// Smallest masks of levels s, m, l, share of the image, four times from level to level: with
+    /// smaller values print and specks become masks, with larger ones things are missed. Half of
+    /// them: 0.920, 1½ times: 0.931, twice: 0.905.
     pub min_masks: [f32; 3],
 }
 
@@ -63,7 +65,7 @@ impl Default for GraphOptions {
     }
 }
 
-/// Everything the tree is built from.
+/// Inputs of the merge tree.
 pub(super) struct Cues<'a> {
     pub(super) labels: Image<i32>,
     pub(super) count: usize,

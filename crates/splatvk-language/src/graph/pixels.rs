@@ -26,25 +26,33 @@ pub(super) fn blur(data: &[[f32; 3]], width: usize, height: usize, sigma: f32) -
     let radius = (3.0 * sigma).ceil().max(1.0) as isize;
     let kernel: Vec<f32> =
         (-radius..=radius).map(|k| (-(k * k) as f32 / (2.0 * sigma * sigma)).exp()).collect();
+    let rows = convolve(data, (width, height), &kernel, (1, 0));
+    convolve(&rows, (width, height), &kernel, (0, 1))
+}
+
+/// Convolution with a normalised kernel of odd length along the direction (dx, dy).
+fn convolve(
+    data: &[[f32; 3]],
+    (width, height): (usize, usize),
+    kernel: &[f32],
+    (dx, dy): (isize, isize),
+) -> Vec<[f32; 3]> {
+    let radius = (kernel.len() / 2) as isize;
     let total: f32 = kernel.iter().sum();
-    let pass = |data: &[[f32; 3]], dx: isize, dy: isize| -> Vec<[f32; 3]> {
-        (0..width * height)
-            .into_par_iter()
-            .map(|p| {
-                let (x, y) = ((p % width) as isize, (p / width) as isize);
-                let mut sum = [0.0; 3];
-                for (k, w) in (-radius..=radius).zip(&kernel) {
-                    let sx = (x + k * dx).clamp(0, width as isize - 1) as usize;
-                    let sy = (y + k * dy).clamp(0, height as isize - 1) as usize;
-                    let v = data[sy * width + sx];
-                    for c in 0..3 {
-                        sum[c] += w * v[c];
-                    }
+    (0..width * height)
+        .into_par_iter()
+        .map(|p| {
+            let (x, y) = ((p % width) as isize, (p / width) as isize);
+            let mut sum = [0.0; 3];
+            for (k, w) in (-radius..=radius).zip(kernel) {
+                let sx = (x + k * dx).clamp(0, width as isize - 1) as usize;
+                let sy = (y + k * dy).clamp(0, height as isize - 1) as usize;
+                let v = data[sy * width + sx];
+                for c in 0..3 {
+                    sum[c] += w * v[c];
                 }
-                sum.map(|s| s / total)
-            })
-            .collect()
-    };
-    let rows = pass(data, 1, 0);
-    pass(&rows, 0, 1)
+            }
+            sum.map(|s| s / total)
+        })
+        .collect()
 }

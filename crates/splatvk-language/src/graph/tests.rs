@@ -3,7 +3,7 @@ use splatvk_infer::{Registry, hed::Hed};
 use splatvk_test_support::breakfast::train_views;
 
 #[test]
-fn every_level_is_a_compact_partition() {
+fn segment_levels_are_compact_partitions() {
     let view = &train_views()[1];
     let edges = Hed::load(&Registry::open(None).unwrap()).unwrap().edges(&view.image).unwrap();
     let masks = segment(&view.image, &edges, &GraphOptions::default()).unwrap();
@@ -12,7 +12,7 @@ fn every_level_is_a_compact_partition() {
         let mut seen = vec![false; level.quality.len()];
         assert_eq!(level.labels.data.len(), view.masks.data.len());
         for &l in &level.labels.data {
-            // everything belongs to something: small regions joined what encloses them
+            // no pixel is a hole: small regions joined the regions around them
             seen[usize::try_from(l).unwrap()] = true;
         }
         assert!(seen.iter().all(|&s| s) && seen.len() > 1);
@@ -46,7 +46,7 @@ fn square() -> (RgbImage, Image<f32>, Image<u32>) {
 }
 
 #[test]
-fn what_a_thing_encloses_belongs_to_it() {
+fn segment_merges_enclosed_region() {
     let (image, edges, truth) = square();
     let masks = segment(&image, &edges, &GraphOptions::default()).unwrap();
     let best = masks.best_ious(&truth, 1)[&1].into_iter().fold(0.0, f64::max);
@@ -55,8 +55,8 @@ fn what_a_thing_encloses_belongs_to_it() {
 }
 
 #[test]
-fn what_no_contour_divides_merges_first_even_where_colours_differ_more() {
-    // A dark stripe, a bright one, and behind the only contour one that is a little brighter still.
+fn merge_order_prefers_contour_over_colour() {
+    // A dark stripe, a bright one and, behind the only contour, a slightly brighter one.
     let (width, height) = (30, 10);
     let stripe = |p: usize| p % width / 10;
     let mut edges = Image::filled(width, height, 0.0);
@@ -68,7 +68,7 @@ fn what_no_contour_divides_merges_first_even_where_colours_differ_more() {
 }
 
 #[test]
-fn a_flat_image_and_wrong_sizes() {
+fn segment_handles_flat_image_and_mismatch() {
     let flat = RgbImage { width: 64, height: 64, data: vec![[0.3; 3]; 4096] };
     let masks = segment(&flat, &Image::filled(64, 64, 0.0), &GraphOptions::default()).unwrap();
     for level in &masks.levels {

@@ -94,20 +94,20 @@ pub(super) fn build(cues: &Cues, options: &GraphOptions) -> Tree {
         let region = union(&nodes[a].region, &nodes[b].region, &shared);
         nodes.push(Node { children: Some((a, b)), parent: usize::MAX, region });
         (nodes[a].parent, nodes[b].parent) = (id, id);
-        let mut mine: BTreeMap<usize, Border> = BTreeMap::new();
+        let mut joined: BTreeMap<usize, Border> = BTreeMap::new();
         for side in [a, b] {
             for (other, border) in std::mem::take(&mut borders[side]) {
                 if other != a && other != b {
-                    mine.entry(other).or_default().add(&border);
+                    joined.entry(other).or_default().add(&border);
                     borders[other].remove(&side);
                 }
             }
         }
-        for (&other, border) in &mine {
+        for (&other, border) in &joined {
             borders[other].insert(id, *border);
             heap.push(MergeCandidate { cost: cost(&nodes, other, id, border), a: other, b: id });
         }
-        borders.push(mine);
+        borders.push(joined);
     }
     Tree { nodes, leaves }
 }
@@ -151,7 +151,7 @@ fn neighbours(p: usize, width: usize, height: usize) -> impl Iterator<Item = usi
 fn leaf_borders(cues: &Cues) -> Vec<BTreeMap<usize, Border>> {
     let (width, height) = (cues.labels.width, cues.labels.height);
     let mut out: Vec<BTreeMap<usize, Border>> = vec![BTreeMap::new(); cues.count];
-    let mut visit = |p: usize, q: usize| {
+    let mut add_border = |p: usize, q: usize| {
         let (a, b) = (cues.labels.data[p] as usize, cues.labels.data[q] as usize);
         if a == b {
             return;
@@ -162,10 +162,10 @@ fn leaf_borders(cues: &Cues) -> Vec<BTreeMap<usize, Border>> {
     };
     for p in 0..width * height {
         if p % width + 1 < width {
-            visit(p, p + 1);
+            add_border(p, p + 1);
         }
         if p / width + 1 < height {
-            visit(p, p + width);
+            add_border(p, p + width);
         }
     }
     out
@@ -183,9 +183,9 @@ fn union(a: &Region, b: &Region, shared: &Border) -> Region {
     out
 }
 
-/// Cost of merging two neighbours: how different their colours are and how strong the border
-/// between them is, less where it is much of the smaller one's outline, all weighed by size so that
-/// small regions go first.
+/// Cost of merging two neighbours: colour difference plus mean boundary strength, lowered by the
+/// share of the smaller outline on their border, and weighted by size so that small regions merge
+/// first.
 fn merge_cost(a: &Region, b: &Region, border: &Border, total: f32, o: &GraphOptions) -> f32 {
     let small = if a.area <= b.area { a } else { b };
     let apart: f32 = (0..3).map(|c| (a.lab[c] / a.area - b.lab[c] / b.area).powi(2)).sum::<f32>().sqrt();

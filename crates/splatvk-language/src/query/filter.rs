@@ -36,7 +36,7 @@ pub fn lerf_mask(blended: &Image<f32>, threshold: f32) -> Image<bool> {
     Image { width: mask.width, height: mask.height, data }
 }
 
-/// Index inside 0..n for an index that may lie outside; reflection without the edge.
+/// Maps an index into 0..n by reflection without repeating the edge.
 fn reflect_101(i: isize, n: usize) -> usize {
     if n == 1 {
         return 0;
@@ -50,8 +50,8 @@ fn replicate(i: isize, n: usize) -> usize {
     i.clamp(0, n as isize - 1) as usize
 }
 
-/// Rows that one task of the vertical pass takes: enough that filling the first window is a small
-/// part of it.
+/// Rows per task of the vertical pass: enough that filling the first window takes a small part of
+/// it.
 const BAND: usize = 96;
 
 /// Separable mean over `size` pixels starting `anchor` before each pixel; running sums in f64.
@@ -70,7 +70,7 @@ fn box_filter(map: &Image<f32>, size: usize, anchor: usize, border: fn(isize, us
             sum += f64::from(row[columns[x + size]]) - f64::from(row[columns[x]]);
         }
     });
-    let row = |y: usize| {
+    let source_row = |y: usize| {
         let from = border(y as isize - anchor as isize, h) * w;
         &rows[from..from + w]
     };
@@ -79,10 +79,10 @@ fn box_filter(map: &Image<f32>, size: usize, anchor: usize, border: fn(isize, us
         let mut sums = vec![0.0f64; w];
         let first = band * BAND;
         for y in first..first + size {
-            sums.iter_mut().zip(row(y)).for_each(|(s, v)| *s += f64::from(*v));
+            sums.iter_mut().zip(source_row(y)).for_each(|(s, v)| *s += f64::from(*v));
         }
         for (k, out) in out.chunks_exact_mut(w).enumerate() {
-            let (gone, new) = (row(first + k), row(first + k + size));
+            let (gone, new) = (source_row(first + k), source_row(first + k + size));
             for ((o, s), (g, n)) in out.iter_mut().zip(&mut sums).zip(gone.iter().zip(new)) {
                 *o = (*s * scale) as f32;
                 *s += f64::from(*n) - f64::from(*g);
@@ -102,8 +102,8 @@ mod tests {
     }
 
     #[test]
-    fn box_matches_the_defining_sum_everywhere() {
-        // narrower than the box too: reflection then folds more than once
+    fn box30_matches_direct_sum() {
+        // maps narrower than the box reflect more than once
         for (w, h) in [(41, 33), (8, 50), (1, 1)] {
             let map = noise(w, h);
             let got = box30(&map);
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn lerf_mask_shrinks_as_the_threshold_grows_and_drops_specks() {
+    fn lerf_mask_shrinks_with_higher_threshold() {
         let mut map = noise(64, 48);
         map.data.iter_mut().for_each(|v| *v *= 0.2);
         for y in 10..30 {

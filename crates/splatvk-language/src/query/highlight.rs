@@ -1,10 +1,10 @@
-//! The answer to a query for the scene as a whole: which codes are highlighted, in any view.
+//! Codes that viewers highlight for a query, in any view.
 use super::{QueryResult, TextQuery, field_relevancy};
 use crate::Result;
 use crate::scene::{Image, LEVEL_NAMES, LanguageField};
 
-/// What viewers draw for a query. The level and the codes are those that answered in the views
-/// where the text was found, so that a viewer lights up what the views' masks show.
+/// Codes that viewers highlight for a query: those of the masks in the views where the text was
+/// found.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Highlight {
     /// Chosen level, index as in [`LEVEL_NAMES`].
@@ -15,8 +15,8 @@ pub struct Highlight {
     pub relevancy: Vec<Vec<f32>>,
 }
 
-/// Sums up the answers to `query` in the frames whose decoded maps are `codes`. Views vote for a
-/// level with their score; where no view found anything, all of them vote.
+/// Combines the answers to `query` in frames with the decoded maps `codes`. The level has the
+/// largest sum of scores over the views that found the text, or over all views if none did.
 pub fn highlight(
     codes: &[&[Image<i32>]],
     field: &LanguageField,
@@ -25,13 +25,13 @@ pub fn highlight(
 ) -> Result<Highlight> {
     let relevancy = field_relevancy(field, query)?;
     let any = answers.iter().any(|a| a.found);
-    let counts = |a: &&QueryResult| a.found || !any;
-    let mut votes = [0.0; LEVEL_NAMES.len()];
-    answers.iter().filter(counts).for_each(|a| votes[a.level] += a.score);
-    // Of equal votes the coarser level's: max_by keeps the last.
-    let level = (0..votes.len()).max_by(|&a, &b| votes[a].total_cmp(&votes[b])).unwrap_or(0);
+    let is_counted = |a: &&QueryResult| a.found || !any;
+    let mut scores = [0.0; LEVEL_NAMES.len()];
+    answers.iter().filter(is_counted).for_each(|a| scores[a.level] += a.score);
+    // Ties go to the coarser level: max_by keeps the last maximum.
+    let level = (0..scores.len()).max_by(|&a, &b| scores[a].total_cmp(&scores[b])).unwrap_or(0);
     let mut chosen = vec![false; relevancy.get(level).map_or(0, Vec::len)];
-    for (frame, answer) in codes.iter().zip(answers).filter(|(_, a)| counts(a) && a.level == level) {
+    for (frame, answer) in codes.iter().zip(answers).filter(|(_, a)| is_counted(a) && a.level == level) {
         for (&code, _) in frame[level].data.iter().zip(&answer.mask.data).filter(|(_, m)| **m) {
             if let Some(c) = usize::try_from(code).ok().and_then(|k| chosen.get_mut(k)) {
                 *c = true;
@@ -61,7 +61,7 @@ mod tests {
     }
 
     #[test]
-    fn codes_of_the_views_that_found_it_light_up() {
+    fn highlight_uses_views_that_found() {
         let fine = level(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
         let coarse = level(&[[0.9, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
         let field = LanguageField { levels: vec![fine, LevelField::default(), coarse], space: "t".into() };
@@ -89,7 +89,7 @@ mod tests {
         assert_eq!((lit.level, &lit.codes[..]), (2, &[0][..]));
         assert_eq!(lit.relevancy.iter().map(Vec::len).collect::<Vec<_>>(), [2, 0, 3]);
         assert!(lit.relevancy[2][0] > 0.99 && lit.relevancy[2][2] < 0.01, "σ(±10·0.9)");
-        // Found nowhere: the better guess.
+        // Found nowhere: the level with the higher score.
         let unseen = [answer(2, false, 0.3, [true, false]), answer(0, false, 0.4, [true, true])];
         let lit = highlight(&frames, &field, &query, &unseen).unwrap();
         assert_eq!((lit.level, &lit.codes[..]), (0, &[1][..]));

@@ -17,6 +17,7 @@ use crate::math::dot;
 use crate::scene::{Codebook, Image, LanguageField, LevelField};
 use crate::{Error, Result};
 use rayon::prelude::*;
+
 /// The phrases that every query is compared against (LERF).
 pub const CANONICAL_PHRASES: [&str; 4] = ["object", "things", "stuff", "texture"];
 
@@ -33,13 +34,13 @@ pub struct TextQuery {
     pub embedding: Vec<f32>,
     /// [C, D] unit rows of the canonical phrases.
     pub canonicals: Vec<f32>,
-    /// What else it could have said; may be nothing.
+    /// Alternatives to the text; may be empty.
     pub alternatives: Alternatives,
-    /// What is understood of it.
+    /// Interpretation of the text.
     pub reading: Reading,
 }
 
-/// How an answer is cut out of the relevancy map.
+/// Options of an answer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct QueryOptions {
     /// Mask rule.
@@ -47,21 +48,20 @@ pub struct QueryOptions {
     /// A query whose best relevancy stays below this is "not found". 0.5 means: no closer than the
     /// nearest canonical phrase (docs/internals/method.md#level-and-mask).
     pub abs_threshold: f32,
-    /// For [`MaskRule::Codes`]: a part of a thing often matches a phrase a little better than the
-    /// thing; the phrase still means the thing. The coarsest level answers whose margin (see
-    /// [`Slack`]) the best level's does not clearly exceed.
+    /// For [`MaskRule::Codes`]: tolerance in the choice of the level. A part often matches a phrase
+    /// slightly better than its whole, although the phrase means the whole. The coarsest level
+    /// within the tolerance of the best margin is chosen.
     pub slack: Slack,
 }
 
-/// By how much a coarser level may be worse and still answer. Levels are compared by their margin:
-/// how much nearer the best code is to the phrase than to every canonical phrase, in units of the
-/// cosine. Relevancy itself is the sigmoid of ten times that: it crowds good answers near 1 and
-/// would take their differences for nothing.
+/// Tolerance by which a coarser level may be worse and is still chosen. Levels are compared by
+/// their margin: cosine of the best code to the phrase less its largest cosine to a canonical
+/// phrase. Relevancy, the sigmoid of ten times the margin, saturates near 1 for good answers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Slack {
-    /// Difference of margins that is noise of the features.
+    /// Difference of margins within the noise of the features.
     pub margin: f32,
-    /// Share of the best margin that is, too.
+    /// Difference within the noise, as a share of the best margin.
     pub share: f32,
 }
 
@@ -71,7 +71,7 @@ pub struct Slack {
 /// 0.2, and 4 to 8 points lower without either.
 pub const SLACK: Slack = Slack { margin: 0.02, share: 0.1 };
 
-/// How the mask follows from relevancy.
+/// Rule that derives the mask from relevancy.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum MaskRule {
@@ -90,9 +90,8 @@ impl Default for QueryOptions {
     }
 }
 
-/// With 0.8, a code joins the best one when it is nearly as relevant: the pieces of an object that
-/// was cut into several masks with alike features do, a different object whose phrase shares some
-/// meaning does not.
+/// Default of [`MaskRule::Codes`]. With 0.8, pieces of one object with similar features join the
+/// best code, and a different object with a related meaning does not.
 pub const CODE_SHARE: f32 = 0.8;
 
 /// The answer to one query in one frame.
@@ -114,9 +113,8 @@ pub struct QueryResult {
 }
 
 impl QueryResult {
-    /// Without a mask, which would look like an answer; what is nearest stays to see in the
-    /// relevancy.
-    pub fn take_back(&mut self) {
+    /// Marks the text as not found and clears the mask; relevancy still shows the nearest codes.
+    pub fn mark_not_found(&mut self) {
         self.found = false;
         self.mask.data.fill(false);
     }
@@ -136,8 +134,8 @@ pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>
             query.embedding.len()
         )));
     }
-    let one = |phi: &[f32]| relevancy(phi, dot(phi, &query.embedding), &query.canonicals);
-    Ok(codebook.embeddings.chunks_exact(d).map(one).collect())
+    let rate = |phi: &[f32]| relevancy(phi, dot(phi, &query.embedding), &query.canonicals);
+    Ok(codebook.embeddings.chunks_exact(d).map(rate).collect())
 }
 
 /// Relevancy of a text whose cosine to the region embedding `phi` is known, against canonical rows
@@ -178,26 +176,27 @@ pub fn answer_all(
 
 /// [`code_relevancy`] of every level, for codes of the colour that the query names.
 pub fn field_relevancy(field: &LanguageField, query: &TextQuery) -> Result<Vec<Vec<f32>>> {
-    let one = |level: &LevelField| {
-        let mut relevancy = code_relevancy(&level.codebook, query)?;
-        other_colours_out(&level.codebook, query, &mut relevancy);
-        Ok(relevancy)
-    };
-    field.levels.iter().map(one).collect()
+    field.levels.iter().map(|level| level_relevancy(level, query)).collect()
 }
 
-/// Where the best code is of the colour that the query names, codes that fit another colour better
-/// are no answers: "yellow brick" means no green one, however alike bricks are. Where it is not,
-/// features say too little of colours to go by them.
-fn other_colours_out(book: &Codebook, query: &TextQuery, relevancy: &mut [f32]) {
+fn level_relevancy(level: &LevelField, query: &TextQuery) -> Result<Vec<f32>> {
+    let mut relevancy = code_relevancy(&level.codebook, query)?;
+    limit_other_colours(&level.codebook, query, &mut relevancy);
+    Ok(relevancy)
+}
+
+/// Limits codes that fit another colour better to a relevancy of 0.5 if the best code has the
+/// colour that the query names: "yellow brick" excludes similar green bricks. If the best code fits
+/// another colour better, features do not separate colours and nothing changes.
+fn limit_other_colours(book: &Codebook, query: &TextQuery, relevancy: &mut [f32]) {
     let rows = || book.embeddings.chunks_exact(book.embedding_dim.max(1));
-    let of_colour = |row: &[f32]| {
+    let has_colour = |row: &[f32]| {
         let own = dot(row, &query.embedding);
         query.alternatives.colours.chunks_exact(row.len()).all(|other| dot(row, other) <= own)
     };
     let best = rows().zip(relevancy.iter()).max_by(|a, b| a.1.total_cmp(b.1));
-    if best.is_some_and(|(row, _)| of_colour(row)) {
-        let others = rows().zip(relevancy).filter(|(row, _)| !of_colour(row));
+    if best.is_some_and(|(row, _)| has_colour(row)) {
+        let others = rows().zip(relevancy).filter(|(row, _)| !has_colour(row));
         others.for_each(|(_, r)| *r = r.min(0.5));
     }
 }
@@ -206,7 +205,7 @@ fn other_colours_out(book: &Codebook, query: &TextQuery, relevancy: &mut [f32]) 
 struct LevelCandidate {
     level: usize,
     raw: Image<f32>,
-    /// By what levels compete.
+    /// Value by which levels are compared.
     peak: f32,
 }
 
@@ -226,8 +225,8 @@ pub fn answer_with(
         .collect();
     let chosen = choose_level(&candidates, options)
         .ok_or_else(|| Error::work("the scene has no language level to query"))?;
-    // With masks of codes the other levels count for the location: the whole "plate" may hold a
-    // lemon, which finer levels tell apart. The published protocols use the chosen level alone
+    // With masks of codes, all levels determine the location: the whole "plate" may include a lemon
+    // that finer levels separate. The published protocols use the chosen level alone
     // (docs/internals/method.md#lerf-ovs).
     let all = matches!(options.mask, MaskRule::Codes(_)).then(|| filter::box30(&sum(&candidates)));
     let best = candidates.swap_remove(chosen);
@@ -263,7 +262,7 @@ fn level_peak(raw: &Image<f32>, rule: MaskRule) -> f32 {
     let data = raw.data.iter().map(|v| (2.0 * v - 1.0).max(0.0)).collect();
     let excess = Image { data, ..*raw };
     let peak = highest(&filter::blend(&excess, &filter::box30(&excess)));
-    // below every canonical phrase: negative, by the best code
+    // no code exceeds the canonical phrases: negative margin of the best code
     margin(if peak > 0.0 { 0.5 + 0.5 * peak } else { highest(raw).min(0.5) })
 }
 
@@ -288,8 +287,8 @@ fn first_best(peaks: &[f32]) -> Option<usize> {
     peaks.iter().position(|&p| p >= top)
 }
 
-/// The last level whose margin the best one's does not clearly exceed; the best one where no phrase
-/// is near.
+/// Last level whose margin is within the slack of the best one; the best level if no margin is
+/// positive.
 fn coarsest_good(peaks: &[f32], slack: Slack) -> Option<usize> {
     let top = peaks.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     if top > 0.0 {
@@ -309,7 +308,7 @@ fn sum(candidates: &[LevelCandidate]) -> Image<f32> {
     sum
 }
 
-/// The pixel with the highest evidence, inside the mask where it has any pixel.
+/// Pixel (column, row) with the highest evidence, inside the mask unless it is empty.
 fn locate(evidence: &[f32], mask: &Image<bool>) -> (usize, usize) {
     let any = mask.data.iter().any(|&m| m);
     let mut top: Option<(f32, usize)> = None;
@@ -322,14 +321,14 @@ fn locate(evidence: &[f32], mask: &Image<bool>) -> (usize, usize) {
     (p % mask.width.max(1), p / mask.width.max(1))
 }
 
-/// Relevancy from which a code joins the best one. Above 0.5 a code is closer to the phrase than to
-/// every canonical; the bar lies a share of the way from there.
+/// Relevancy from which a code joins the best one: `share` of the way from 0.5, where a code is as
+/// close to the phrase as to a canonical phrase, to the best relevancy `top`.
 fn code_bar(top: f32, share: f32) -> f32 {
     if top > 0.5 { 0.5 + share * (top - 0.5) } else { top }
 }
 
-/// Pixels of the codes that answer the query ([`MaskRule::Codes`]). Only codes that this frame
-/// shows compete, so that a code seen elsewhere does not suppress the best one here.
+/// Pixels of the codes that answer the query ([`MaskRule::Codes`]). Only codes visible in this
+/// frame are compared, so that a code of another view does not suppress the best one here.
 fn code_mask(map: &Image<i32>, relevancy: &[f32], share: f32) -> Image<bool> {
     let mut shown = vec![false; relevancy.len()];
     for &k in map.data.iter().filter(|&&k| k >= 0) {

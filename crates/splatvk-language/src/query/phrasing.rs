@@ -1,13 +1,13 @@
-//! Words of a text that no embedding of a few words carries: negations, places, and choices among
-//! several. A text that has them is answered for the rest of it, and says so
+//! Detects words that the embedding of a short text cannot express: negations, places, and choices
+//! among several. The answer is for the rest of the text, and a note states the words left out
 //! (docs/internals/method.md#phrasing).
 use crate::{Error, Result};
 use serde::Serialize;
 
-/// Most characters of a question. A thing is named in a few words; text models read about 77 or 128
-/// parts of words.
+/// Largest number of characters in a question. A few words name a thing; text models read about 77
+/// or 128 tokens.
 pub const MOST_CHARACTERS: usize = 300;
-/// Most words of a question.
+/// Largest number of words in a question.
 pub const MOST_WORDS: usize = 40;
 
 /// Refuses a question that is empty or too long.
@@ -26,32 +26,32 @@ pub fn check(text: &str) -> Result<()> {
     )))
 }
 
-/// From one of these on a text says what is not meant.
+/// Words that begin a negation.
 const NEGATIONS: &str =
     "without|not|no|never|except|excluding|but|neither|nor|isn't|aren't|don't|doesn't|instead of|than";
 
-/// From one of these on it says where a thing is.
+/// Words that begin a place.
 const PLACES: &str = "on|in|inside|outside|at|under|underneath|beneath|below|above|over|behind|beside|besides|near|between|among|\
     around|against|opposite|across|by the|next to|close to|in front of|on top of|left of|right of|to the left|to the right";
 
-/// Of those, the ones that also begin names of things: "over ear headphones", "in line skates".
-/// They count at the start of a text only before an article.
+/// Words of [`PLACES`] that also begin names of things: "over ear headphones", "in line skates". At
+/// the start of a text they begin a place only before an article.
 const PARTICLES: &str = "on|in|inside|outside|at|under|above|over|across|around";
 
-/// Words before a particle with which it makes one name: "carry on bag", "plug in", "pull over".
+/// Words that form a name with the particle behind them: "carry on bag", "plug in", "pull over".
 const VERBS: &str = "carry|clip|slip|roll|plug|built|walk|drive|sign|log|pull|all|two|add|stick|drop|push|step|strap|screw|snap|\
     tie|iron|sit|stand|lie|turn|flip|fold|hang|play|sing|bolt|lace|check|cut|fill|head";
 
-/// First words that choose one of several, after an article or not.
+/// Words that choose one of several, at the start of a text or behind its articles.
 const CHOICES: &str = "first|second|third|fourth|fifth|last|other|another|left|right|middle|leftmost|rightmost|topmost|nearest|\
     closest|farthest|furthest|biggest|largest|smallest|tallest|shortest|longest";
 
-/// Names that hold such a word and mean one thing.
+/// Names of one thing that contain words of the lists above.
 const NAMES: &str = "first aid|second hand|right angle|left handed|right handed|middle finger|last supper|jack in the box|\
     jack in the pulpit|corn on the cob|soap on a rope|toad in the hole|pig in a blanket|pigs in blankets|pigs in a blanket|\
     hole in the wall|bag in box|forget me not|touch me not|do not disturb|on off|bed in a bag|man in the moon|lily of the valley";
 
-/// A notice is called by what it says: "no smoking sign".
+/// Last words of the names of notices, which contain negations: "no smoking sign".
 const NOTICES: &str = "sign|signs|symbol|sticker|notice|button";
 
 const ARTICLES: &str = "the|a|an|this|that|these|those|my|your|its|his|her|their|our";
@@ -60,7 +60,7 @@ const ARTICLES: &str = "the|a|an|this|that|these|those|my|your|its|his|her|their
 const LOOSE_ENDS: &str =
     "that|which|who|is|are|was|and|or|but|with|the|a|an|to|it|do|does|sitting|standing|lying|placed|of";
 
-/// A text of which only a part is understood.
+/// Split of a text of which only a part is understood.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Phrasing {
     /// The part that the answer is for.
@@ -70,27 +70,27 @@ pub struct Phrasing {
 }
 
 impl Phrasing {
-    /// For people.
+    /// Note for the user.
     pub fn note(&self) -> String {
         format!("answers for “{}”; “{}” is not understood", self.answers_for, self.not_understood)
     }
 }
 
-/// Whether the words of a text are among those that its model knows.
+/// Whether a text is in the vocabulary of its model.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Vocabulary {
-    /// They are.
+    /// Whether the text is in the vocabulary.
     pub known: bool,
-    /// The word that the model knows which is nearest to them.
+    /// Nearest word of the vocabulary.
     pub nearest: String,
 }
 
-/// What is understood of a text.
+/// Interpretation of a text.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Reading {
-    /// Where that is a part of it only.
+    /// Split of the text, if only a part of it is understood.
     pub phrasing: Option<Phrasing>,
-    /// From models that know a list of words.
+    /// Look-up in the vocabulary, for models that have one.
     pub vocabulary: Option<Vocabulary>,
 }
 
@@ -100,7 +100,7 @@ impl Reading {
         self.phrasing.is_some() || self.vocabulary.as_ref().is_some_and(|v| !v.known)
     }
 
-    /// For people, one line each.
+    /// Note for the user, one line each.
     pub fn notes(&self) -> Vec<String> {
         let unknown = self.vocabulary.as_ref().filter(|v| !v.known);
         let unknown = unknown.map(|v| format!("outside vocabulary; nearest: “{}”", v.nearest));
@@ -108,81 +108,84 @@ impl Reading {
     }
 }
 
-/// The part of a text that is understood; `None` where that is all of it.
+/// Splits a text into the part that is understood and the rest; `None` if all of it is understood.
 pub fn read(text: &str) -> Option<Phrasing> {
     let said: Vec<&str> = text.split_whitespace().collect();
-    let bare = |w: &&str| {
-        w.to_lowercase().replace('’', "'").trim_matches(|c: char| ",.;:!?\"".contains(c)).to_owned()
-    };
-    let words: Vec<String> = said.iter().map(bare).collect();
-    let split = |answered: &[&str], left_out: &[&str]| {
-        (!answered.is_empty() && !left_out.is_empty())
-            .then(|| Phrasing { answers_for: answered.join(" "), not_understood: left_out.join(" ") })
-    };
-    let start = words.iter().take_while(|w| is(ARTICLES, w)).count();
-    if let Some(word) = words.get(start).filter(|w| is(CHOICES, w)) {
+    let words: Vec<String> = said.iter().map(|w| without_punctuation(w)).collect();
+    let start = words.iter().take_while(|w| contains(ARTICLES, w)).count();
+    if let Some(word) = words.get(start).filter(|w| contains(CHOICES, w)) {
         let place =
             matches!(word.as_str(), "left" | "right") && words.get(start + 1).is_some_and(|w| w == "of");
         if !place && !in_name(&words, start) {
-            // What stands behind the choice may have more to leave out: "the second cup on the
-            // table".
+            // The rest may contain more to leave out: "the second cup on the table".
             let rest = said[start + 1..].join(" ");
             let inner = read(&rest);
             let answered = inner.as_ref().map_or(rest.as_str(), |p| p.answers_for.as_str());
             let more = inner.as_ref().map(|p| p.not_understood.as_str());
             let left_out: Vec<&str> = std::iter::once(said[start]).chain(more).collect();
-            return split(&[answered][..usize::from(!answered.is_empty())], &left_out);
+            return phrasing(&[answered][..usize::from(!answered.is_empty())], &left_out);
         }
     }
-    let (at, length) = (0..words.len()).find_map(|at| Some((at, leaves_out(&words, at)?)))?;
-    // "bigger than the plate": the word before belongs to it.
+    let (at, length) = (0..words.len()).find_map(|at| Some((at, marker_length(&words, at)?)))?;
+    // "bigger than the plate": the word before "than" is left out, too.
     let from = if words[at] == "than" { at.saturating_sub(1) } else { at };
-    let end = words[..from].iter().rposition(|w| !is(LOOSE_ENDS, w)).map_or(0, |last| last + 1);
-    match words[..end].iter().any(|w| !is(ARTICLES, w)) {
-        true => split(&said[..end], &said[from..]),
-        // "left of the plate", "not the red one": what the words are about is all there is to look
-        // for.
+    let end = words[..from].iter().rposition(|w| !contains(LOOSE_ENDS, w)).map_or(0, |last| last + 1);
+    match words[..end].iter().any(|w| !contains(ARTICLES, w)) {
+        true => phrasing(&said[..end], &said[from..]),
+        // "left of the plate", "not the red one": the object behind the words is answered.
         false => {
-            let behind = words[at + length..].iter().take_while(|w| is(ARTICLES, w) || *w == "of").count();
-            split(&said[at + length + behind..], &said[from..at + length])
+            let behind =
+                words[at + length..].iter().take_while(|w| contains(ARTICLES, w) || *w == "of").count();
+            phrasing(&said[at + length + behind..], &said[from..at + length])
         }
     }
 }
 
-/// How many words from here on begin what a text leaves out.
-fn leaves_out(words: &[String], at: usize) -> Option<usize> {
+/// A word in lower case with straight apostrophes, without punctuation around it.
+fn without_punctuation(w: &str) -> String {
+    w.to_lowercase().replace('’', "'").trim_matches(|c: char| ",.;:!?\"".contains(c)).to_owned()
+}
+
+fn phrasing(answered: &[&str], left_out: &[&str]) -> Option<Phrasing> {
+    (!answered.is_empty() && !left_out.is_empty())
+        .then(|| Phrasing { answers_for: answered.join(" "), not_understood: left_out.join(" ") })
+}
+
+/// Number of words from `at` on that begin a part to leave out.
+fn marker_length(words: &[String], at: usize) -> Option<usize> {
     if in_name(words, at) {
         return None;
     }
-    let notice = words.last().is_some_and(|w| is(NOTICES, w));
-    if let Some(length) = begins(NEGATIONS, &words[at..]).filter(|_| !notice) {
+    let notice = words.last().is_some_and(|w| contains(NOTICES, w));
+    if let Some(length) = longest_prefix(NEGATIONS, &words[at..]).filter(|_| !notice) {
         return (at + length < words.len()).then_some(length);
     }
-    let length = begins(PLACES, &words[at..]).filter(|length| at + length < words.len())?;
-    let particle = length == 1 && is(PARTICLES, &words[at]);
+    let length = longest_prefix(PLACES, &words[at..]).filter(|length| at + length < words.len())?;
+    let particle = length == 1 && contains(PARTICLES, &words[at]);
     let counts = match at.checked_sub(1) {
         _ if !particle => true,
-        None => is(ARTICLES, &words[at + 1]),
-        Some(before) => !is(VERBS, &words[before]),
+        None => contains(ARTICLES, &words[at + 1]),
+        Some(before) => !contains(VERBS, &words[before]),
     };
     counts.then_some(length)
 }
 
-/// Words of the longest entry that the words begin with.
-fn begins(list: &str, words: &[String]) -> Option<usize> {
-    let fits = |entry: &str| {
-        let parts: Vec<&str> = entry.split(' ').collect();
-        (parts.len() <= words.len() && parts.iter().zip(words).all(|(p, w)| p == w)).then_some(parts.len())
-    };
-    list.split('|').filter_map(fits).max()
+/// Number of words in the longest entry of `list` that `words` begin with.
+fn longest_prefix(list: &str, words: &[String]) -> Option<usize> {
+    list.split('|').filter_map(|entry| prefix_length(entry, words)).max()
 }
 
-/// Whether the word is part of a name.
+fn prefix_length(entry: &str, words: &[String]) -> Option<usize> {
+    let parts: Vec<&str> = entry.split(' ').collect();
+    (parts.len() <= words.len() && parts.iter().zip(words).all(|(p, w)| p == w)).then_some(parts.len())
+}
+
+/// Whether the word at `at` is part of one of the [`NAMES`].
 fn in_name(words: &[String], at: usize) -> bool {
-    (0..=at).any(|from| begins(NAMES, &words[from..]).is_some_and(|length| from + length > at))
+    (0..=at).any(|from| longest_prefix(NAMES, &words[from..]).is_some_and(|length| from + length > at))
 }
 
-fn is(list: &str, word: &str) -> bool {
+fn contains(list: &str, word: &str) -> bool {
     list.split('|').any(|entry| entry == word)
 }
 
@@ -193,7 +196,7 @@ mod tests {
     use splatvk_test_support::breakfast;
 
     #[test]
-    fn what_is_not_understood_is_left_out() {
+    fn read_leaves_out_unsupported_words() {
         for (text, answered, left_out) in [
             ("mug without handle", "mug", "without handle"),
             ("a Mug without a handle", "a Mug", "without a handle"),
@@ -233,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn questions_beyond_the_limit_are_refused() {
+    fn check_refuses_long_questions() {
         for text in ["lemon", &"ab ".repeat(MOST_WORDS), &"ä".repeat(MOST_CHARACTERS)] {
             check(text).unwrap();
         }
@@ -246,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn names_of_things_are_understood() {
+    fn read_keeps_names_of_things() {
         for text in [
             "remote control",
             "cup of tea",
@@ -303,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn no_phrase_of_the_lists_is_cut() {
+    fn read_keeps_all_listed_phrases() {
         let classes = Registry::open(None).unwrap().path(PackFileKind::Classes).unwrap();
         let classes = std::fs::read_to_string(classes).unwrap();
         let first = classes.lines().filter_map(|l| l.split(['\t', ',']).next().map(str::to_owned));

@@ -1,60 +1,61 @@
-//! Whether a scene shows what a text means (docs/internals/method.md#presence): a text is weighed
-//! against other things that it could have said. One that fits the scene no better than they do is
-//! no evidence of anything.
+//! Conformal test of whether a scene shows the thing that a text names
+//! (docs/internals/method.md#presence). The text is compared with names of other things; one that
+//! fits the scene no better than they do is no evidence.
 use crate::math::dot_f32 as dot;
 use crate::scene::{Image, LanguageField};
 use rayon::prelude::*;
 use serde::Serialize;
 use std::sync::Arc;
 
-/// Fewer other things tell nothing: the least share that they can state is above [`FOUND`].
+/// Smallest number n of other things for a test: the smallest p-value, 1 / (1 + n), is below
+/// [`FOUND`].
 pub const MIN_OTHERS: usize = 20;
 
-/// Share of other things that fit at least as well, up to which a text is found. Of texts that are
-/// not in the scene no more than this share is called found, as far as they are like the other
-/// things: the level of a conformal test.
+/// Largest p-value of a found text: the level of the conformal test. Of texts that are not in the
+/// scene, at most this share is called found if they are exchangeable with the other things.
 pub const FOUND: f32 = 0.05;
 
-/// The same, from which on a text is not in the scene: three of four things that are hardly there
-/// fit better. Of what is in `breakfast` and five generated scenes (tuning; built-in words) one in
-/// sixteen is above, of what is not one in seven.
+/// Smallest p-value of an absent text: three of four other things fit better. In `breakfast` and
+/// five generated scenes (tuning; built-in words), one in sixteen things that are present is above,
+/// and one in seven that are not.
 const ABSENT: f32 = 0.75;
 
-/// Codes that show less than this share of all pixels are specks, which answer anything by chance.
+/// Smallest share of all pixels of a code. Smaller codes are specks, which match any text by
+/// chance.
 const LEAST_SHARE: f64 = 3e-4;
 
-/// What a text could have said instead.
+/// Embeddings of alternatives to a text.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Alternatives {
-    /// [N, D] unit rows of other things; the same for many texts.
+    /// [N, D] unit rows of other things; shared by many texts.
     pub things: Arc<Vec<f32>>,
     /// [M, D] unit rows of the same thing in other colours.
     pub colours: Vec<f32>,
 }
 
-/// Whether something is in a scene.
+/// Presence of a thing in a scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Presence {
-    /// It is.
+    /// It is in the scene.
     Found,
-    /// What the features say does not decide.
+    /// The features do not decide.
     Unsure,
-    /// It is not.
+    /// It is not in the scene.
     Absent,
 }
 
-/// What speaks for a text.
+/// Result of the presence test.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Evidence {
     /// The verdict.
     pub presence: Presence,
-    /// Share of other things that fit the scene at least as well, in (0, 1].
+    /// Share of texts that fit the scene at least as well, this one included, in (0, 1].
     pub p_value: f32,
 }
 
 impl Evidence {
-    /// The same, where the answer may be for something else than what was asked.
+    /// Lowers [`Presence::Found`] to [`Presence::Unsure`], for a text that may be misread.
     pub fn in_doubt(self) -> Evidence {
         match self.presence {
             Presence::Found => Evidence { presence: Presence::Unsure, ..self },
@@ -63,7 +64,7 @@ impl Evidence {
     }
 }
 
-/// How much views show of every code.
+/// Number of pixels that views show of every code.
 #[derive(Clone, Debug, Default)]
 pub struct ShownPixels {
     /// Per level [K] pixels.
@@ -90,7 +91,7 @@ impl ShownPixels {
         }
     }
 
-    /// Of several views.
+    /// Counts several views.
     pub fn of(field: &LanguageField, views: &[&[Image<i32>]]) -> ShownPixels {
         let mut shown = ShownPixels::default();
         views.iter().for_each(|maps| shown.add(field, maps));
@@ -98,14 +99,14 @@ impl ShownPixels {
     }
 }
 
-/// The codes that views show, and what of their meaning the canonical phrases have.
+/// Codes visible in views, with their cosines to canonical phrases.
 pub struct ShownCodes<'f> {
     /// [D] embedding, and the largest cosine to a canonical phrase.
     codes: Vec<(&'f [f32], f32)>,
 }
 
 impl<'f> ShownCodes<'f> {
-    /// Those of `field` that are no specks.
+    /// Collects the visible codes of `field` without specks.
     pub fn new(shown: &ShownPixels, field: &'f LanguageField, canonicals: &[f32]) -> ShownCodes<'f> {
         let mut codes = Vec::new();
         for ((level, shown), all) in field.levels.iter().zip(&shown.codes).zip(&shown.all) {
@@ -120,29 +121,29 @@ impl<'f> ShownCodes<'f> {
         ShownCodes { codes }
     }
 
-    /// The code that fits a text best, and by how much it is nearer to it than to every canonical
-    /// phrase, as a difference of cosines.
+    /// The code with the largest margin, and its margin: cosine to the text less the largest cosine
+    /// to a canonical phrase.
     fn best(&self, text: &[f32]) -> Option<(&'f [f32], f32)> {
         let fits = self.codes.iter().map(|(row, common)| (*row, dot(row, text) - common));
         fits.max_by(|a, b| a.1.total_cmp(&b.1))
     }
 
-    /// The scores of other things.
+    /// Margins of other things [N, D].
     pub fn background(&self, others: &[f32]) -> Background {
         let dim = self.codes.first().map_or(1, |c| c.0.len());
         let scores = others.par_chunks_exact(dim).filter_map(|other| Some(self.best(other)?.1));
         Background { scores: scores.collect() }
     }
 
-    /// What speaks for a text against the scores of other things, and its embedding in other
-    /// colours ([`Alternatives::colours`]); `None` where there are too few other things to say, or
-    /// no code is shown.
+    /// Tests a text against the margins of other things and its embeddings in other colours
+    /// ([`Alternatives::colours`]); `None` with fewer than [`MIN_OTHERS`] other things or without a
+    /// visible code.
     pub fn evidence(&self, text: &[f32], colours: &[f32], background: &Background) -> Option<Evidence> {
         if background.scores.len() < MIN_OTHERS {
             return None;
         }
         let (code, own) = self.best(text)?;
-        // "green mug": the code that fits it best is a blue mug.
+        // "green mug" whose best code is a blue mug.
         let fit = dot(code, text);
         let other_colour = colours.chunks_exact(code.len()).any(|c| dot(code, c) > fit);
         let better = background.scores.iter().filter(|other| **other >= own).count();
@@ -156,7 +157,7 @@ impl<'f> ShownCodes<'f> {
     }
 }
 
-/// How well other things fit a scene.
+/// Margins of other things in a scene.
 #[derive(Clone, Debug, Default)]
 pub struct Background {
     scores: Vec<f32>,

@@ -1,11 +1,12 @@
-//! Splats that a query selects in space, without any view
+//! Selects the splats that answer a query in space, without any view
 //! (docs/internals/method.md#selection-in-space).
 use super::instances::Places;
 use super::{MaskRule, QueryOptions, TextQuery, field_relevancy, margin};
 use crate::Result;
 use crate::scene::LanguageField;
 
-/// Codes that fewer splats carry are specks: at a pixel per splat, less than a mask may be.
+/// Smallest number of splats of a code. Smaller codes are specks: at a pixel per splat, below the
+/// smallest mask.
 const MIN_SPLATS: usize = 32;
 
 /// The splats that answer a query.
@@ -23,7 +24,7 @@ pub struct Selection {
 }
 
 /// Selects by the rule of the `field` masks: the coarsest level that is nearly as good as the best
-/// one answers, and of its codes those nearly as relevant as the best.
+/// one, and its codes that are nearly as relevant as the best.
 pub fn select(
     field: &LanguageField,
     places: &Places,
@@ -32,12 +33,12 @@ pub fn select(
 ) -> Result<Selection> {
     let relevancy = field_relevancy(field, query)?;
     let mut found: Vec<(usize, f32, &[Option<usize>])> = Vec::new();
-    for (l, (of, values)) in places.codes().iter().zip(&relevancy).enumerate() {
+    for (l, (codes, values)) in places.codes().iter().zip(&relevancy).enumerate() {
         let mut carried = vec![0usize; values.len()];
-        of.iter().flatten().for_each(|&k| carried[k] += 1);
+        codes.iter().flatten().for_each(|&k| carried[k] += 1);
         let solid = values.iter().zip(&carried).filter(|(_, n)| **n >= MIN_SPLATS).map(|(v, _)| *v);
         if let Some(best) = solid.reduce(f32::max) {
-            found.push((l, best, of));
+            found.push((l, best, codes));
         }
     }
     let peaks: Vec<f32> = found.iter().map(|f| margin(f.1)).collect();
@@ -46,14 +47,14 @@ pub fn select(
         MaskRule::Lerf(_) => super::first_best(&peaks),
     };
     let Some(chosen) = chosen else { return Ok(Selection::default()) };
-    let (level, score, of) = &found[chosen];
+    let (level, score, codes) = &found[chosen];
     let share = match options.mask {
         MaskRule::Codes(share) => share,
         MaskRule::Lerf(_) => super::CODE_SHARE,
     };
     let bar = super::code_bar(*score, share);
     let answers = |k: &Option<usize>| k.is_some_and(|k| relevancy[*level][k] >= bar);
-    let splats = of.iter().enumerate().filter(|(_, k)| answers(k)).map(|(i, _)| i).collect();
+    let splats = codes.iter().enumerate().filter(|(_, k)| answers(k)).map(|(i, _)| i).collect();
     Ok(Selection { level: *level, splats, score: *score, found: *score >= options.abs_threshold })
 }
 
@@ -63,7 +64,7 @@ mod tests {
     use crate::scene::{Codebook, LevelField, Splats};
 
     #[test]
-    fn splats_are_chosen_by_their_codes_on_the_coarsest_good_level() {
+    fn select_uses_coarsest_good_level() {
         // embeddings: the thing, almost the thing, something else; canonical orthogonal to all
         let rows: Vec<f32> = [[0.8, 0.0, 0.6, 0.0], [0.78, 0.0, 0.6258, 0.0], [0.0, 1.0, 0.0, 0.0]].concat();
         let codes = vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];

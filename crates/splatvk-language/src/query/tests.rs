@@ -46,7 +46,7 @@ fn frame() -> Image<i32> {
 }
 
 #[test]
-fn relevancy_is_the_worst_pairwise_softmax() {
+fn relevancy_is_lowest_pairwise_softmax() {
     let (field, q) = (field(), query(&[1.0, 0.2, 0.0, 0.1]));
     let got = code_relevancy(&field.levels[1].codebook, &q).unwrap();
     for (k, phi) in field.levels[1].codebook.embeddings.chunks(4).enumerate() {
@@ -62,7 +62,7 @@ fn relevancy_is_the_worst_pairwise_softmax() {
 }
 
 #[test]
-fn the_mask_follows_code_borders_exactly() {
+fn answer_mask_follows_code_borders() {
     let maps = vec![Image::filled(60, 40, -1), frame(), frame()];
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
     assert_eq!(r.level, 2, "the whole answers when it is as good as its part");
@@ -78,7 +78,7 @@ fn the_mask_follows_code_borders_exactly() {
     let strict = QueryOptions { mask: MaskRule::Codes(1.0), ..QueryOptions::default() };
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &strict).unwrap();
     assert!(maps[1].data.iter().zip(&r.mask.data).all(|(&k, &m)| m == (k == 0)));
-    // where the view does not show that code, its near-copy is the best
+    // without that code in the view, its near-copy is the best
     let mut maps = maps;
     maps.iter_mut().flat_map(|m| &mut m.data).filter(|k| **k == 0).for_each(|k| *k = 1);
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &strict).unwrap();
@@ -86,7 +86,7 @@ fn the_mask_follows_code_borders_exactly() {
 }
 
 #[test]
-fn a_speck_does_not_outvote_the_whole() {
+fn answer_ignores_better_speck() {
     let mut part = frame();
     // level 1 shows the better code 0 on a few pixels only, level 2 its near-copy over the whole
     // square
@@ -97,20 +97,20 @@ fn a_speck_does_not_outvote_the_whole() {
     let mut whole = frame();
     whole.data.iter_mut().filter(|k| **k == 0).for_each(|k| *k = 2);
     let maps = vec![Image::filled(60, 40, -1), part, whole];
-    let ask = |slack: Slack| {
+    let level_with = |slack: Slack| {
         let options = QueryOptions { slack, ..QueryOptions::default() };
         answer(&maps, &field(), &query(&[1.0, 0.0, -0.02, 0.1]), &options).unwrap().level
     };
-    assert_eq!((ask(Slack { margin: 0.0, share: 0.0 }), ask(SLACK)), (2, 2));
-    // LERF's rule looks at the peak alone
+    assert_eq!((level_with(Slack { margin: 0.0, share: 0.0 }), level_with(SLACK)), (2, 2));
+    // LERF's rule uses only the peak
     let lerf = QueryOptions { mask: MaskRule::Lerf(0.6), ..QueryOptions::default() };
     assert!(answer(&maps, &field(), &query(&[1.0, 0.0, -0.02, 0.1]), &lerf).is_ok());
 }
 
 #[test]
-fn a_clearly_better_part_answers_and_a_marginally_better_one_does_not() {
+fn answer_prefers_clearly_better_part() {
     // Level 1 and level 2 show one thing; the part's code is nearer to the phrase by the tilt.
-    let ask = |tilt: f32| {
+    let chosen_level = |tilt: f32| {
         let entry = |first: f32| unit(&[first, 1.0, 0.0, 0.0]);
         let level = |embedding: Vec<f32>| LevelField {
             codebook: Codebook { embedding_dim: 4, embeddings: embedding, ..Codebook::default() },
@@ -122,11 +122,11 @@ fn a_clearly_better_part_answers_and_a_marginally_better_one_does_not() {
         answer(&maps, &field, &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap().level
     };
     // Margins: cosine 0.707 of the whole; 0.74 (within 0.02 and a tenth) and 0.89 of the part.
-    assert_eq!((ask(0.1), ask(1.0)), (2, 1));
+    assert_eq!((chosen_level(0.1), chosen_level(1.0)), (2, 1));
 }
 
 #[test]
-fn frames_are_answered_alike_one_by_one_and_together() {
+fn answer_all_equals_single_answers() {
     let (one, two) = (vec![frame(), frame(), frame()], vec![Image::filled(60, 40, -1), frame(), frame()]);
     let q = query(&[1.0, 0.0, 0.0, 0.0]);
     let together = answer_all(&[&one, &two], &field(), &q, &QueryOptions::default()).unwrap();
@@ -138,7 +138,7 @@ fn frames_are_answered_alike_one_by_one_and_together() {
 }
 
 #[test]
-fn what_no_code_means_is_not_found() {
+fn answer_unrelated_text_is_not_found() {
     let maps = vec![Image::filled(60, 40, -1), frame(), frame()];
     let r = answer(&maps, &field(), &query(&[0.0, 0.0, -1.0, 0.0]), &QueryOptions::default()).unwrap();
     assert!(!r.found && r.score < 0.5);
@@ -147,7 +147,7 @@ fn what_no_code_means_is_not_found() {
 }
 
 #[test]
-fn an_all_void_frame_has_an_empty_mask() {
+fn answer_void_frame_has_empty_mask() {
     let maps = vec![Image::filled(60, 40, -1); 3];
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
     assert!(!r.found && r.mask.data.iter().all(|m| !m));
@@ -173,7 +173,7 @@ fn oracle_vectors(count: usize, dim: usize) -> Vec<Vec<f32>> {
 }
 
 #[test]
-fn perfect_masks_and_distinct_features_answer_every_phrase() {
+fn answer_distinct_features_find_every_phrase() {
     use crate::scene::DepthMap;
     use crate::{BuildOptions, LevelMasks, ViewMasks, build};
     use splatvk_test_support::breakfast::{phrases, train_views};
@@ -228,7 +228,7 @@ fn perfect_masks_and_distinct_features_answer_every_phrase() {
 }
 
 #[test]
-fn the_location_avoids_what_a_finer_level_tells_apart() {
+fn answer_location_respects_finer_level() {
     // The whole (level 2) spans a rectangle; on level 1 only its right part matches, as a plate
     // around a lemon does.
     let map = |from: usize| {

@@ -7,29 +7,29 @@ pub(super) struct Bits {
     pub width: usize,
     pub height: usize,
     words: Vec<u64>,
-    /// Smallest box, ends excluded: (columns, rows).
+    /// Bounding box, ends excluded: (columns, rows).
     pub bounds: (Range<usize>, Range<usize>),
     count: usize,
 }
 
 impl Bits {
-    /// From lengths of runs, the first of them outside the mask.
+    /// Decodes run lengths; the first run is outside the mask.
     pub fn from_runs(width: usize, height: usize, runs: &[u32]) -> Bits {
-        let mut bits = Bits::of(width, height, |_| false);
-        let mut at = 0usize;
+        let mut bits = Bits::from_fn(width, height, |_| false);
+        let mut start = 0usize;
         for (k, run) in runs.iter().enumerate() {
-            let end = (at + *run as usize).min(width * height);
+            let end = (start + *run as usize).min(width * height);
             if k % 2 == 1 {
-                bits.fill(at..end);
+                bits.fill(start..end);
             }
-            at = end;
+            start = end;
         }
         bits.measure();
         bits
     }
 
-    /// The pixels for which `inside` holds.
-    pub fn of(width: usize, height: usize, inside: impl Fn(usize) -> bool) -> Bits {
+    /// Sets the pixels for which `inside` is true.
+    pub fn from_fn(width: usize, height: usize, inside: impl Fn(usize) -> bool) -> Bits {
         let mut words = vec![0u64; (width * height).div_ceil(64)];
         for p in (0..width * height).filter(|p| inside(*p)) {
             words[p / 64] |= 1 << (p % 64);
@@ -100,14 +100,13 @@ impl Bits {
         let mut grid: Vec<bool> = (0..self.width * self.height).map(|p| self.has(p)).collect();
         let mut changed = false;
         for island in [false, true] {
-            let (pieces, sizes) = self.pieces(&grid, island);
+            let (pieces, sizes) = self.components(&grid, island);
             let small: Vec<bool> = sizes.iter().map(|s| *s < least).collect();
             if !small.contains(&true) {
                 continue;
             }
             let largest = (0..sizes.len()).max_by_key(|k| sizes[*k]);
-            // A mask of small islands only stays what its largest one is; an image of small holes
-            // only is filled.
+            // If all islands are small, the largest one stays; small holes are always filled.
             let all_small = island && !small.contains(&false);
             for (value, piece) in grid.iter_mut().zip(&pieces) {
                 let Some(k) = piece else { continue };
@@ -118,13 +117,14 @@ impl Bits {
             }
         }
         if changed {
-            *self = Bits::of(self.width, self.height, |p| grid[p]);
+            *self = Bits::from_fn(self.width, self.height, |p| grid[p]);
         }
         changed
     }
 
-    /// The 8-connected pieces of the pixels that are `value`: piece per pixel, size per piece.
-    fn pieces(&self, grid: &[bool], value: bool) -> (Vec<Option<usize>>, Vec<usize>) {
+    /// Labels the 8-connected components of the pixels equal to `value`: component per pixel, size
+    /// per component.
+    fn components(&self, grid: &[bool], value: bool) -> (Vec<Option<usize>>, Vec<usize>) {
         let (mut piece, mut sizes) = (vec![None; grid.len()], Vec::new());
         let mut stack = Vec::new();
         for start in 0..grid.len() {

@@ -1,9 +1,9 @@
-//! Logits at points → proposals: enlarged to the photo, tested for stability, cut-off ones dropped,
-//! kept as runs.
+//! Turns logits at points into proposals: upsamples them to the photo, tests their stability, drops
+//! masks cut off by a crop and stores run lengths.
 use rayon::prelude::*;
 use splatvk_infer::sam::{MASKS, Proposals};
 
-/// Boxes nearer than this to a crop's border are cut off there, pixels
+/// Distance from a crop's border, pixels, up to which a box counts as cut off
 /// (docs/internals/method.md#masks-from-points).
 pub(super) const BORDER: i32 = 20;
 
@@ -30,16 +30,16 @@ pub(super) struct MaskProposal {
 /// Logit offset of the stability test (docs/internals/method.md#masks-from-points).
 const OFFSET: f32 = 1.0;
 
-/// One axis of the enlargement: first source index and the weight of the next one, per target
-/// pixel.
+/// Bilinear weights of one axis: per target pixel the first source index and the weight of the
+/// next.
 fn axis(pixels: usize, cells: usize, filled: f64) -> Vec<(usize, f32)> {
     let scale = cells as f64 * filled / pixels as f64;
-    let one = |p: usize| {
-        let at = ((p as f64 + 0.5) * scale - 0.5).clamp(0.0, (cells - 1) as f64);
-        let first = (at as usize).min(cells.saturating_sub(2));
-        (first, (at - first as f64) as f32)
-    };
-    (0..pixels).map(one).collect()
+    let weights = (0..pixels).map(|p| {
+        let position = ((p as f64 + 0.5) * scale - 0.5).clamp(0.0, (cells - 1) as f64);
+        let first = (position as usize).min(cells.saturating_sub(2));
+        (first, (position - first as f64) as f32)
+    });
+    weights.collect()
 }
 
 /// The proposals that pass `least` = (predicted IoU, stability), per point three, in order.
@@ -57,22 +57,22 @@ pub(super) fn candidates(
     let (w, h) = (proposals.width, proposals.height);
     let columns = axis(crop.x1 - crop.x0, w, proposals.filled[0]);
     let rows = axis(crop.y1 - crop.y0, h, proposals.filled[1]);
-    let one = |k: usize| {
+    let candidate = |k: usize| {
         let iou = proposals.scores[k];
-        // Not `<=`: a predicted IoU that is no number passes no test.
-        let good = iou > least.0;
-        let logits = proposals.logits.get(k * w * h..(k + 1) * w * h).filter(|_| good)?;
+        // Not `<=`: NaN must fail.
+        let passes = iou > least.0;
+        let logits = proposals.logits.get(k * w * h..(k + 1) * w * h).filter(|_| passes)?;
         let enlarged = enlarge(logits, w, &columns, &rows);
         let above = |t: f32| enlarged.iter().filter(|v| **v > t).count();
-        let (sure, loose) = (above(OFFSET), above(-OFFSET));
-        let stability = sure as f32 / loose.max(1) as f32;
+        let (inner, outer) = (above(OFFSET), above(-OFFSET));
+        let stability = inner as f32 / outer.max(1) as f32;
         let crop_width = crop.x1 - crop.x0;
         let bounds = bounds(&enlarged, crop_width)?;
         let whole = !cut_off(bounds, crop, photo);
         let runs = (stability >= least.1 && whole).then(|| runs(&enlarged, crop, photo))?;
         Some(MaskProposal { level: k % MASKS, crop: index, iou, stability, runs })
     };
-    (0..points.len() * MASKS).into_par_iter().filter_map(one).collect()
+    (0..points.len() * MASKS).into_par_iter().filter_map(candidate).collect()
 }
 
 fn enlarge(logits: &[f32], w: usize, columns: &[(usize, f32)], rows: &[(usize, f32)]) -> Vec<f32> {
@@ -101,7 +101,7 @@ fn bounds(logits: &[f32], width: usize) -> Option<[i32; 4]> {
     (x.1 >= 0).then_some([x.0, y.0, x.1, y.1])
 }
 
-/// A box that touches the crop's border where that is not the photo's.
+/// Whether a box touches a border of the crop that is not a border of the photo.
 fn cut_off(b: [i32; 4], crop: Crop, photo: (usize, usize)) -> bool {
     let near = |v: i32, edge: usize| (v - edge as i32).abs() <= BORDER;
     let x = [b[0] + crop.x0 as i32, b[2] + crop.x0 as i32];
@@ -112,31 +112,47 @@ fn cut_off(b: [i32; 4], crop: Crop, photo: (usize, usize)) -> bool {
         || near(y[1], crop.y1) && !near(y[1], photo.1)
 }
 
+/// Run lengths of a mask over the rows of the photo.
 fn runs(logits: &[f32], crop: Crop, photo: (usize, usize)) -> Vec<u32> {
     let width = crop.x1 - crop.x0;
-    let (mut all, mut inside, mut length) = (Vec::new(), false, 0u32);
-    let mut push = |value: bool, n: u32| {
-        if n == 0 {
-            return;
-        }
-        if value != inside {
-            all.push(length);
-            (inside, length) = (value, 0);
-        }
-        length += n;
-    };
-    push(false, (crop.y0 * photo.0) as u32);
+    let mut runs = RunEncoder::default();
+    runs.push(false, (crop.y0 * photo.0) as u32);
     for row in logits.chunks_exact(width) {
-        push(false, crop.x0 as u32);
-        row.iter().for_each(|v| push(*v > 0.0, 1));
-        push(false, (photo.0 - crop.x1) as u32);
+        runs.push(false, crop.x0 as u32);
+        row.iter().for_each(|v| runs.push(*v > 0.0, 1));
+        runs.push(false, (photo.0 - crop.x1) as u32);
     }
-    push(false, ((photo.1 - crop.y1) * photo.0) as u32);
-    all.push(length);
-    all
+    runs.push(false, ((photo.1 - crop.y1) * photo.0) as u32);
+    runs.finish()
 }
 
-/// Proposals as a row of values for the cache. Whole numbers stay exact: no photo has 2²⁴ pixels.
+/// Encodes pixels as lengths of runs, the first of them outside the mask.
+#[derive(Default)]
+struct RunEncoder {
+    runs: Vec<u32>,
+    inside: bool,
+    length: u32,
+}
+
+impl RunEncoder {
+    fn push(&mut self, inside: bool, pixels: u32) {
+        if pixels == 0 {
+            return;
+        }
+        if inside != self.inside {
+            self.runs.push(self.length);
+            (self.inside, self.length) = (inside, 0);
+        }
+        self.length += pixels;
+    }
+
+    fn finish(mut self) -> Vec<u32> {
+        self.runs.push(self.length);
+        self.runs
+    }
+}
+
+/// Encodes proposals as floats for the cache. Integers stay exact: no photo has 2²⁴ pixels.
 pub(super) fn pack(all: &[MaskProposal]) -> Vec<f32> {
     let mut out = Vec::new();
     for c in all {

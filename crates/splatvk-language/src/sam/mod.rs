@@ -1,6 +1,6 @@
 //! Masks from a network that is prompted with points (docs/internals/method.md#masks-from-points):
 //! a grid of points over the photo and over four overlapping crops, three masks each, one list per
-//! level; poor, unstable and doubled ones are dropped and the rest painted into label maps.
+//! level; poor, unstable and duplicate masks are dropped and the rest painted into label maps.
 mod bits;
 mod filter;
 mod nms;
@@ -9,7 +9,7 @@ mod paint;
 #[cfg(test)]
 mod tests;
 
-use super::ViewMasks;
+use super::{LevelMasks, ViewMasks};
 use crate::progress::Progress;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
@@ -21,27 +21,26 @@ use splatvk_infer::contract::Part;
 use splatvk_infer::installed::Installed;
 use splatvk_infer::sam::{BATCH, MASKS, Sam};
 
-/// How masks are proposed and chosen; the defaults are the paper's (LangSplat's).
+/// Options of the mask generator; the defaults are those of the paper (LangSplat's).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct SamOptions {
     /// Points along each side of the photo, and of each crop.
     pub points: usize,
-    /// Also look at four overlapping crops.
+    /// Also process four overlapping crops.
     pub crops: bool,
     /// Least predicted IoU.
     pub min_iou: f32,
-    /// Least stability: share of the mask that is left when its threshold rises from −1 to +1.
+    /// Least stability: share of the mask at threshold −1 that remains at +1.
     pub min_stability: f32,
-    /// Boxes that overlap more are the same mask.
+    /// Box IoU above which two masks are duplicates.
     pub box_overlap: f32,
-    /// Holes and islands smaller than this are cleaned up, pixels.
+    /// Size below which holes are filled and islands removed, pixels.
     pub min_region: usize,
-    /// Masks that overlap more are the same.
+    /// Mask IoU above which two masks are duplicates.
     pub mask_overlap: f32,
     /// Least predicted IoU · stability.
     pub min_score: f32,
-    /// Paint masks in the order in which they came, those that needed a clean-up last, as LangSplat
-    /// does; else larger ones first.
+    /// Paint masks in list order, cleaned-up ones last, as LangSplat; else larger ones first.
     pub paint_in_order: bool,
 }
 
@@ -61,16 +60,16 @@ impl Default for SamOptions {
     }
 }
 
-/// Proposals below these are not kept, so that thresholds can be lowered to them without asking the
-/// network again.
+/// Smallest (predicted IoU, stability) of cached proposals: the options can be lowered to these
+/// without running the network again.
 const KEPT: (f32, f32) = (0.5, 0.5);
 
-/// The photo and, if asked for, the four overlapping quarters of layer 1
+/// The whole photo and, with `quarters`, the four overlapping crops of layer 1
 /// (docs/internals/method.md#masks-from-points).
 fn crops(width: usize, height: usize, quarters: bool) -> Vec<Crop> {
     let mut all = vec![Crop { x0: 0, y0: 0, x1: width, y1: height }];
     if quarters {
-        // 512/1500 of the shorter side, shared by two crops a side.
+        // Two crops per side overlap by 512/1500 of the shorter side.
         let overlap = (512.0 / 1500.0 * width.min(height) as f64) as usize;
         let side = |n: usize| (overlap + n).div_ceil(2);
         let (w, h) = (side(width), side(height));
@@ -86,11 +85,11 @@ fn crops(width: usize, height: usize, quarters: bool) -> Vec<Crop> {
 /// Points on a grid over a crop, in its pixels, x fastest.
 fn grid(n: usize, crop: Crop) -> Vec<[f64; 2]> {
     let (w, h) = ((crop.x1 - crop.x0) as f64, (crop.y1 - crop.y0) as f64);
-    let at = |k: usize| (k as f64 + 0.5) / n as f64;
-    (0..n).flat_map(|j| (0..n).map(move |i| [at(i) * w, at(j) * h])).collect()
+    let centre = |k: usize| (k as f64 + 0.5) / n as f64;
+    (0..n).flat_map(|j| (0..n).map(move |i| [centre(i) * w, centre(j) * h])).collect()
 }
 
-/// Masks of every photo.
+/// Computes the masks of every photo.
 pub fn masks(
     model: &Installed,
     images: &[RgbImage],
@@ -103,8 +102,8 @@ pub fn masks(
     let compute = model.compute();
     let _turn = compute.turn();
     let mut network: Option<Sam> = None;
-    let looks = if options.crops { 5 } else { 1 };
-    let calls = options.points.pow(2).div_ceil(BATCH) * looks;
+    let crops = if options.crops { 5 } else { 1 };
+    let calls = options.points.pow(2).div_ceil(BATCH) * crops;
     progress.begin("masks", (calls * images.len()) as u64);
     let mut views = Vec::with_capacity(images.len());
     for (k, image) in images.iter().enumerate() {
@@ -136,7 +135,7 @@ pub fn masks(
     Ok(views)
 }
 
-/// Everything that the network proposes for a photo and that is not hopeless.
+/// Proposals of the network for a photo that pass the thresholds [`KEPT`].
 fn propose(
     net: &mut Sam,
     image: &RgbImage,
@@ -172,38 +171,49 @@ fn cut(image: &RgbImage, crop: Crop) -> RgbImage {
     RgbImage { width: crop.x1 - crop.x0, height: crop.y1 - crop.y0, data: rows.copied().collect() }
 }
 
-/// Proposals → label maps of the three levels.
+/// Selects proposals and paints the label maps of the three levels.
 fn choose(candidates: Vec<MaskProposal>, width: usize, height: usize, options: &SamOptions) -> ViewMasks {
     let areas: Vec<usize> =
         crops(width, height, options.crops).iter().map(|c| (c.x1 - c.x0) * (c.y1 - c.y0)).collect();
-    let level = |level: usize| {
-        let mine: Vec<Mask> = candidates
-            .iter()
-            .filter(|c| c.level == level && c.iou > options.min_iou && c.stability >= options.min_stability)
-            .map(|c| Mask {
-                bits: Bits::from_runs(width, height, &c.runs),
-                iou: c.iou,
-                stability: c.stability,
-                crop: c.crop,
-                changed: false,
-            })
-            .collect();
-        // Per crop the best guess wins, across crops the closest look, after the clean-up what
-        // needed none.
-        let mut kept: Vec<Mask> = Vec::new();
-        for crop in 0..areas.len() {
-            let some = mine.iter().filter(|m| m.crop == crop).cloned().collect();
-            kept.extend(nms::boxes(some, options.box_overlap, |m| m.iou));
-        }
-        let area = |m: &Mask| areas.get(m.crop).copied().unwrap_or(1) as f32;
-        kept = nms::boxes(kept, options.box_overlap, |m| 1.0 / area(m));
-        for mask in &mut kept {
-            mask.changed = mask.bits.clean(options.min_region);
-        }
-        kept.retain(|m| m.bits.count() > 0);
-        kept = nms::boxes(kept, options.box_overlap, |m| if m.changed { 0.0 } else { 1.0 });
-        kept = nms::masks(kept, options.mask_overlap, options.min_score);
-        paint::labels(&kept, options.paint_in_order, width, height)
-    };
-    ViewMasks { levels: (0..MASKS).map(level).collect() }
+    let levels = (0..MASKS).map(|level| {
+        let of_level: Vec<&MaskProposal> = candidates.iter().filter(|c| c.level == level).collect();
+        choose_level(&of_level, &areas, (width, height), options)
+    });
+    ViewMasks { levels: levels.collect() }
+}
+
+/// Label map of one level; `areas` has the pixels of each crop.
+fn choose_level(
+    proposals: &[&MaskProposal],
+    areas: &[usize],
+    (width, height): (usize, usize),
+    options: &SamOptions,
+) -> LevelMasks {
+    let candidates: Vec<Mask> = proposals
+        .iter()
+        .filter(|c| c.iou > options.min_iou && c.stability >= options.min_stability)
+        .map(|c| Mask {
+            bits: Bits::from_runs(width, height, &c.runs),
+            iou: c.iou,
+            stability: c.stability,
+            crop: c.crop,
+            changed: false,
+        })
+        .collect();
+    // Box NMS keeps the higher predicted IoU within a crop, the smaller crop across crops, and
+    // the unchanged mask after the clean-up.
+    let mut kept: Vec<Mask> = Vec::new();
+    for crop in 0..areas.len() {
+        let of_crop = candidates.iter().filter(|m| m.crop == crop).cloned().collect();
+        kept.extend(nms::boxes(of_crop, options.box_overlap, |m| m.iou));
+    }
+    let area = |m: &Mask| areas.get(m.crop).copied().unwrap_or(1) as f32;
+    kept = nms::boxes(kept, options.box_overlap, |m| 1.0 / area(m));
+    for mask in &mut kept {
+        mask.changed = mask.bits.clean(options.min_region);
+    }
+    kept.retain(|m| m.bits.count() > 0);
+    kept = nms::boxes(kept, options.box_overlap, |m| if m.changed { 0.0 } else { 1.0 });
+    kept = nms::masks(kept, options.mask_overlap, options.min_score);
+    paint::labels(&kept, options.paint_in_order, width, height)
 }

@@ -1,4 +1,4 @@
-//! The generator against a decoder whose masks are known exactly: discs around the prompt point.
+//! Tests with a decoder whose masks are known exactly: discs around the prompt point.
 use super::*;
 use crate::progress::Silent;
 use splatvk_infer::Registry;
@@ -8,7 +8,7 @@ use splatvk_test_support::onnx::{Attribute, FLOAT, Onnx};
 use std::path::Path;
 
 const LOW: usize = 64;
-/// Radii of the single guess and of the three levels, pixels of the 256-pixel input.
+/// Radii of the single best mask and of the three levels, pixels of the 256-pixel input.
 const RADII: [f32; 4] = [1.0, 25.0, 30.0, 60.0];
 
 /// Logits (radius² − distance²) / 40 around the point: stability follows from the radius, the
@@ -71,7 +71,7 @@ fn toy(iou: [f32; 4], options: &SamOptions, size: (usize, usize)) -> ViewMasks {
 }
 
 #[test]
-fn every_level_holds_the_discs_of_its_radius() {
+fn masks_levels_contain_their_discs() {
     let options = SamOptions { points: 3, crops: false, ..SamOptions::default() };
     let view = toy([0.99, 0.9, 0.9, 0.9], &options, (256, 192));
     // A 3 × 3 grid on 256 × 192: 85 × 64 apart. Discs of radius 25 and 30 do not touch; those of 60
@@ -95,7 +95,7 @@ fn every_level_holds_the_discs_of_its_radius() {
 }
 
 #[test]
-fn poor_and_unstable_masks_are_dropped_and_the_crops_add_finer_points() {
+fn masks_drop_poor_and_unstable_proposals() {
     let options = SamOptions { points: 3, crops: false, ..SamOptions::default() };
     let poor = toy([0.99, 0.9, 0.65, 0.9], &options, (256, 192));
     assert_eq!(poor.levels[1].quality.len(), 0, "predicted IoU of 0.65");
@@ -107,7 +107,7 @@ fn poor_and_unstable_masks_are_dropped_and_the_crops_add_finer_points() {
 }
 
 #[test]
-fn a_decoder_with_one_mask_is_refused() {
+fn sam_single_mask_decoder_is_refused() {
     let dir = tempfile::tempdir().unwrap();
     disc_network(dir.path(), [0.9; 4]);
     Onnx::new()
@@ -123,7 +123,7 @@ fn a_decoder_with_one_mask_is_refused() {
 }
 
 #[test]
-fn the_photo_and_its_quarters_as_the_reference_cuts_them() {
+fn crops_match_reference() {
     // segment_anything.utils.amg.generate_crop_boxes((480, 640), 1, 512 / 1500), XYXY.
     let boxes: Vec<[usize; 4]> = crops(640, 480, true).iter().map(|c| [c.x0, c.y0, c.x1, c.y1]).collect();
     assert_eq!(boxes, REFERENCE);
@@ -137,7 +137,7 @@ const REFERENCE: [[usize; 4]; 5] =
     [[0, 0, 640, 480], [0, 0, 402, 322], [0, 159, 402, 480], [239, 0, 640, 322], [239, 159, 640, 480]];
 
 #[test]
-fn a_mask_seen_in_a_crop_lies_where_the_crop_does() {
+fn candidates_include_crop_offset() {
     // Logits of ten pixels each in a crop of 140 × 110; the mask is columns 5 to 8 and rows 4 to 7
     // of them.
     let (width, height) = (14, 11);
@@ -151,7 +151,7 @@ fn a_mask_seen_in_a_crop_lies_where_the_crop_does() {
 }
 
 fn rectangle(x: std::ops::Range<usize>, y: std::ops::Range<usize>, iou: f32) -> Mask {
-    let bits = Bits::of(50, 40, |p| x.contains(&(p % 50)) && y.contains(&(p / 50)));
+    let bits = Bits::from_fn(50, 40, |p| x.contains(&(p % 50)) && y.contains(&(p / 50)));
     Mask { bits, iou, stability: 1.0, crop: 0, changed: false }
 }
 
@@ -170,7 +170,7 @@ fn seeded() -> Vec<Mask> {
 }
 
 #[test]
-fn mask_suppression_agrees_with_the_plain_double_loop() {
+fn mask_nms_matches_double_loop() {
     let all = seeded();
     let set = |m: &Mask| -> Vec<bool> { (0..2000).map(|p| m.bits.has(p)).collect() };
     let sets: Vec<Vec<bool>> = all.iter().map(set).collect();
@@ -195,7 +195,7 @@ fn mask_suppression_agrees_with_the_plain_double_loop() {
 }
 
 #[test]
-fn without_a_good_mask_the_three_best_stay() {
+fn mask_nms_keeps_three_poor_masks() {
     let poor = vec![
         rectangle(0..5, 0..5, 0.1),
         rectangle(10..15, 0..5, 0.4),
@@ -208,7 +208,7 @@ fn without_a_good_mask_the_three_best_stay() {
 }
 
 #[test]
-fn boxes_that_overlap_too_much_leave_the_better_one() {
+fn box_nms_keeps_better_box() {
     let two = vec![rectangle(0..21, 0..21, 0.8), rectangle(0..21, 0..25, 0.9), rectangle(25..40, 0..20, 0.7)];
     let kept: Vec<f32> = nms::boxes(two.clone(), 0.7, |m| m.iou).iter().map(|m| m.iou).collect();
     assert_eq!(kept, [0.9, 0.7]);
@@ -217,8 +217,8 @@ fn boxes_that_overlap_too_much_leave_the_better_one() {
 }
 
 #[test]
-fn holes_are_filled_and_islands_removed() {
-    let mut bits = Bits::of(50, 40, |p| {
+fn clean_fills_holes_and_removes_islands() {
+    let mut bits = Bits::from_fn(50, 40, |p| {
         let (x, y) = (p % 50, p / 50);
         let body =
             (5..30).contains(&x) && (5..30).contains(&y) && !((10..12).contains(&x) && (10..12).contains(&y));
@@ -227,17 +227,17 @@ fn holes_are_filled_and_islands_removed() {
     assert!(bits.clean(100));
     assert_eq!((bits.count(), bits.bounds.clone()), (625, (5..30, 5..30)));
     assert!(!bits.clean(100), "nothing left to do");
-    let mut dots = Bits::of(50, 40, |p| [(3, 3), (4, 3), (20, 20)].contains(&(p % 50, p / 50)));
+    let mut dots = Bits::from_fn(50, 40, |p| [(3, 3), (4, 3), (20, 20)].contains(&(p % 50, p / 50)));
     assert!(dots.clean(100));
     assert_eq!(dots.ones().collect::<Vec<_>>(), [153, 154], "the largest island stays");
-    let mut full = Bits::of(50, 40, |_| true);
+    let mut full = Bits::from_fn(50, 40, |_| true);
     assert!(!full.clean(100) && full.count() == 2000);
     assert_eq!(Bits::from_runs(50, 40, &[153, 2, 1845]), dots);
     assert_eq!(full.shared(&dots), 2);
 }
 
 #[test]
-fn every_painted_pixel_belongs_to_a_mask_that_covers_it_and_small_ones_lie_on_top() {
+fn paint_puts_small_masks_on_top() {
     let all = seeded();
     let level = paint::labels(&all, false, 50, 40);
     let scores: Vec<f32> = all.iter().map(Mask::score).collect();
@@ -253,7 +253,7 @@ fn every_painted_pixel_belongs_to_a_mask_that_covers_it_and_small_ones_lie_on_to
     let nested =
         paint::labels(&[rectangle(10..20, 10..20, 0.9), rectangle(0..40, 0..40, 0.99)], false, 50, 40);
     assert_eq!((nested.labels.at(15, 15), nested.labels.at(5, 5), nested.labels.at(45, 5)), (0, 1, -1));
-    // What lies on a mask hides nothing of it from the encoder.
+    // `whole` keeps pixels that are covered by a smaller mask.
     assert_eq!(nested.whole.len(), 2);
     let pixels = |label: i32| nested.whole.iter().flat_map(|m| &m.data).filter(|l| **l == label).count();
     assert_eq!((pixels(0), pixels(1)), (100, 1600));

@@ -15,7 +15,7 @@ pub struct MaskId {
 }
 
 impl MaskId {
-    /// From the indices that loops count with.
+    /// From indices of loops.
     pub fn new(view: usize, mask: usize) -> MaskId {
         MaskId { view: view as u32, mask: mask as u32 }
     }
@@ -65,8 +65,8 @@ impl Codebook {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
-    /// `argmax_k F·c_k` (docs/internals/method.md#decoding-codes); ties take the lowest k; `None`
-    /// without codes.
+    /// Index of the nearest code, `argmax_k F·c_k` (docs/internals/method.md#decoding-codes); ties
+    /// take the lowest k; `None` without codes.
     pub fn decode(&self, feature: &[f32]) -> Option<usize> {
         let mut best: Option<(f32, usize)> = None;
         for (k, code) in self.codes.chunks_exact(self.code_dim.max(1)).enumerate() {
@@ -82,46 +82,46 @@ impl Codebook {
 /// One level of the language field.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct LevelField {
-    /// The bijection.
+    /// The bijection between embeddings and codes.
     pub codebook: Codebook,
     /// [N, d] splat features as rendered (the renderer's semantic channels), splat order of the
     /// scene.
     pub features: Vec<f32>,
-    /// [N] the stored mixes of codes that give the features; empty where features are no mixes.
+    /// [N] stored mixes of codes from which the features follow; empty where features are no mixes.
     pub mixes: Vec<CodeMix>,
     /// [N] agreement of the photos on the thing of a splat, in 0..1
-    /// (docs/internals/method.md#reliability); empty where that is not known.
+    /// (docs/internals/method.md#reliability); empty where unknown.
     pub reliability: Vec<f32>,
     /// Per training view: code index per pixel, −1 = none. Training targets; empty in a loaded
     /// scene.
     pub targets: Vec<Image<i32>>,
-    /// The splats that the features were trained on, where the level has a model of its own; `None`
-    /// = those of the scene. As many as the scene has, in its order.
+    /// Splats that the features were trained on, where the level has a model of its own; `None` =
+    /// the splats of the scene. Same number and order as in the scene.
     pub splats: Option<Splats>,
 }
 
 impl LevelField {
-    /// The splats that carry the features, of a scene whose own are `shared`.
+    /// Splats that carry the features, in a scene whose own splats are `shared`.
     pub fn carrier<'a>(&'a self, shared: &'a Splats) -> &'a Splats {
         self.splats.as_ref().unwrap_or(shared)
     }
 
-    /// Takes over features [N, d] of any length: as unit mixes of two codes, or as they are where a
-    /// mix cannot name the codes.
-    pub fn carry(&mut self, features: Vec<f32>) {
-        self.carry_mixes(code_mix::mixes(&features, &self.codebook.codes, self.codebook.code_dim));
+    /// Stores features [N, d] of any length: as unit mixes of two codes, or unchanged where a mix
+    /// cannot index the codes.
+    pub fn set_features(&mut self, features: Vec<f32>) {
+        self.set_mixes(code_mix::mixes(&features, &self.codebook.codes, self.codebook.code_dim));
         if self.mixes.is_empty() {
             self.features = features;
         }
     }
 
-    /// Takes over mixes of its codes.
-    pub fn carry_mixes(&mut self, mixes: Vec<CodeMix>) {
+    /// Stores mixes of the level's codes.
+    pub fn set_mixes(&mut self, mixes: Vec<CodeMix>) {
         self.features = code_mix::features(&mixes, &self.codebook.codes, self.codebook.code_dim);
         self.mixes = mixes;
     }
 
-    /// The rows of some of its splats.
+    /// The given rows, in their order, of a level with `splats` splats.
     fn picked(self, rows: &[usize], splats: usize) -> LevelField {
         let width = self.features.len() / splats.max(1);
         let row = |i: &usize| &self.features[i * width..(i + 1) * width];
