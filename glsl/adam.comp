@@ -1,21 +1,25 @@
 #version 460
-// One Adam step (Kingma & Ba 2015) on `count` parameters; beta1 0.9, beta2 0.999, eps 1e-15 as in 3D Gaussian splatting.
-// The host computes the bias corrections in f64 and writes rates[slot] = (head rate, tail rate, second, unused) before
-// each step, so one recording serves all steps: rates include 1/(1-beta1^t), second is 1/sqrt(1-beta2^t).
+// One Adam step (Kingma & Ba 2015) on `count` parameters; beta1 0.9, beta2 0.999, eps 1e-15 as in
+// 3D Gaussian splatting. The host computes the bias corrections in f64 and writes rates[slot] =
+// (head rate, tail rate, second, unused) before each step, so one recording serves all steps: the
+// rates include 1/(1-beta1^t), second is 1/sqrt(1-beta2^t).
 //   p -= rate * m / (sqrt(v) * second + eps)
-// The first `head` of every `stride` parameters use the head rate, the others the tail rate (SH: DC and the rest).
-// The guard is the rasteriser's status: a frame whose tile lists overflowed has no gradients, and the step is repeated.
-// A parameter whose gradient is not finite is left alone and counted in `faults`: the host stops with a clear error.
-// Four parameters per thread: on a CPU device an access costs the same whatever its width, on a GPU it is coalesced
-// either way. Buffers are padded to whole vectors: the last thread may have one vector of moments instead of two.
+// The first `head` of every `stride` parameters use the head rate, the others the tail rate (SH: DC
+// and the rest). The guard is the status of the rasteriser: a frame whose tile lists overflowed has
+// no gradients, and the step is repeated. A parameter whose gradient is not finite stays and is
+// counted in `faults`; the host then stops with an error. Four parameters per thread: on a CPU
+// device an access costs the same at any width, on a GPU it is coalesced either way. Buffers are
+// padded to whole vectors: the last thread may have one vector of moments instead of two.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 256) in;
 layout(std430, binding = 0) buffer Parameters { vec4 parameters[]; };
 layout(std430, binding = 1) readonly buffer Gradients { vec4 gradients[]; };
-layout(std430, binding = 2) buffer Moments { vec4 moments[]; };  // (m, v) per parameter, two parameters a vector
+// (m, v) per parameter, two parameters a vector.
+layout(std430, binding = 2) buffer Moments { vec4 moments[]; };
 layout(std430, binding = 3) buffer Faults { uint faults[]; };
 layout(std430, binding = 4) readonly buffer Rates { vec4 rates[]; };
-layout(std430, binding = 5) readonly buffer Guard { uint guard[]; };  // [2]; the step is void where guard[1] is not 0
+// [2]; the step is void where guard[1] is not 0.
+layout(std430, binding = 5) readonly buffer Guard { uint guard[]; };
 layout(push_constant) uniform Push { uint count; uint stride; uint head; uint slot; };
 const float BETA1 = 0.9, BETA2 = 0.999, EPS = 1e-15;
 
@@ -31,7 +35,7 @@ void main() {
     uint column = 4u * i % stride, bad = 0u;
     [[unroll]] for (uint k = 0u; k < 4u; k++) {
         float g = gradient[k];
-        // isnan and isinf may be optimised away by drivers
+        // Drivers may optimise isnan and isinf away.
         bool finite = (floatBitsToUint(g) & 0x7f800000u) != 0x7f800000u;
         vec2 mv = vec2(pair[k / 2u][2u * (k % 2u)], pair[k / 2u][2u * (k % 2u) + 1u]);
         vec2 next = vec2(BETA1 * mv.x + (1.0 - BETA1) * g, BETA2 * mv.y + (1.0 - BETA2) * g * g);

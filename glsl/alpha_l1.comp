@@ -1,9 +1,13 @@
 #version 460
-// Adds the gradient of weight * sum of |A - a| over the pixels with a wanted alpha a, with A = 1 - T as rendered.
+// Adds the gradient of weight * sum of |A - a| over the pixels with a wanted alpha a; A = 1 - T is
+// the rendered alpha.
 layout(local_size_x = 64) in;
-layout(std430, binding = 0) readonly buffer Wanted { float wanted[]; };  // [H*W] alpha, negative = no opinion
-layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; };  // [H*W] 1 - A
-layout(std430, binding = 2) buffer Upstream { float upstream[]; };  // [4 + d + 1, H*W], the last by A
+// [H*W] alpha, negative = none.
+layout(std430, binding = 0) readonly buffer Wanted { float wanted[]; };
+// [H*W] 1 - A.
+layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; };
+// [4 + d + 1, H*W], the last by A.
+layout(std430, binding = 2) buffer Upstream { float upstream[]; };
 layout(push_constant) uniform Push { uint pixels; uint alpha_plane; float weight; };
 
 void main() {

@@ -1,5 +1,5 @@
 #version 450
-// Copies a buffer, to measure what memory gives: STEPS vec4 per thread, neighbours in neighbouring threads.
+// Copies a buffer, for benchmarks: STEPS vec4 per thread, neighbours in neighbouring threads.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 256) in;
 layout(std430, binding = 0) readonly buffer Source { vec4 source[]; };

@@ -1,5 +1,5 @@
 #version 450
-// Fused multiply-adds on registers, to measure what the arithmetic units give: 16 independent chains hide their latency.
+// Fused multiply-adds on registers, for benchmarks: 16 independent chains hide their latency.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) buffer Values { float values[]; }; // [threads]

@@ -1,5 +1,6 @@
 #version 450
-// Counters to the place where each lane of bin_emit.comp writes its first entry of a tile. Reference: pass::bin.
+// Turns counters into the position of the first entry of each (tile, lane) of bin_emit.comp.
+// Reference: pass::bin.
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer TileRanges { uint tile_ranges[]; }; // [tiles + 1]

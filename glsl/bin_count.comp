@@ -3,9 +3,10 @@
 #extension GL_GOOGLE_include_directive : require
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };       // [N, 3]
-layout(std430, binding = 1) readonly buffer DepthPairs { uvec2 depth_pairs[]; };   // [N] (key, splat), sorted
-layout(std430, binding = 2) writeonly buffer TileCounts { uint tile_counts[]; };   // [N]
+layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };  // [N, 3]
+// [N] (key, splat), sorted.
+layout(std430, binding = 1) readonly buffer DepthPairs { uvec2 depth_pairs[]; };
+layout(std430, binding = 2) writeonly buffer TileCounts { uint tile_counts[]; };  // [N]
 layout(push_constant) uniform Push { uint count; uint tiles_x; uint first_row; uint end_row; };
 
 #include "shared/tiles.glsl"

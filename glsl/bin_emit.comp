@@ -1,13 +1,15 @@
 #version 450
 // variants: GROUPING=0,1
-// Writes the entries: for every splat in depth order its tiles, row by row. A lane makes the same number of entries as
-// every other, so a splat that covers the screen is shared by many. If the entries do not fit, there are none, and the
-// status says how much room is needed: an image without splats, never one with a few of them missing. Reference: pass::bin.
+// Writes the entries: for every splat in depth order its tiles, row by row. All lanes write the
+// same number of entries, so many lanes share a splat that covers the screen. If the entries do not
+// fit, none is written and the status holds the number needed: the image then has no splats at all,
+// never a few missing. Reference: pass::bin.
 //
 // Rows of tiles from first_row up to end_row of the image are binned; tile 0 is the first of these.
 //
-// GROUPING 0 (counting, see bin_scatter.comp): entries are (tile, splat), and the lane counts them per tile.
-// GROUPING 1 (sorting, see bin_ranges.comp): entries are (tile, own index), and `entry_splats` keeps the splat.
+// GROUPING 0 (counting, see bin_scatter.comp): entries are (tile, splat), and the lane counts them
+// per tile. GROUPING 1 (sorting, see bin_ranges.comp): entries are (tile, own index), and
+// `entry_splats` holds the splat.
 #extension GL_GOOGLE_include_directive : require
 #if GROUPING == 0
 layout(local_size_x = 8) in;
@@ -15,16 +17,19 @@ layout(local_size_x = 8) in;
 layout(local_size_x = 64) in;
 #endif
 
-layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };         // [N, 3]
-layout(std430, binding = 1) readonly buffer DepthPairs { uvec2 depth_pairs[]; };     // [N] (key, splat), sorted
-layout(std430, binding = 2) readonly buffer Starts { uint starts[]; };               // [N] first entry, in depth order
-layout(std430, binding = 3) buffer Status { uint status[]; };                        // [3] see FrameBuffers
-layout(std430, binding = 4) writeonly buffer EntryCount { uint entry_count; };       // entries, 0 if they do not fit
-layout(std430, binding = 5) writeonly buffer Entries { uvec2 entries[]; };           // [capacity]
+layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };  // [N, 3]
+// [N] (key, splat), sorted.
+layout(std430, binding = 1) readonly buffer DepthPairs { uvec2 depth_pairs[]; };
+// [N] first entry, in depth order.
+layout(std430, binding = 2) readonly buffer Starts { uint starts[]; };
+layout(std430, binding = 3) buffer Status { uint status[]; };  // [3] see FrameBuffers
+// Entries, 0 if they do not fit.
+layout(std430, binding = 4) writeonly buffer EntryCount { uint entry_count; };
+layout(std430, binding = 5) writeonly buffer Entries { uvec2 entries[]; };  // [capacity]
 #if GROUPING == 0
-layout(std430, binding = 6) buffer Counters { uint counters[]; };                    // [tiles, lanes]
+layout(std430, binding = 6) buffer Counters { uint counters[]; };  // [tiles, lanes]
 #else
-layout(std430, binding = 7) writeonly buffer EntrySplats { uint entry_splats[]; };   // [capacity]
+layout(std430, binding = 7) writeonly buffer EntrySplats { uint entry_splats[]; };  // [capacity]
 #endif
 layout(push_constant) uniform Push {
     uint count; uint tiles_x; uint first_row; uint end_row; uint lanes; uint capacity;
@@ -57,7 +62,8 @@ void main() {
     uint rank = rank_of(begin), entry = starts[rank], splat = depth_pairs[rank].y;
     Ellipse e = ellipse_of(splat, first_row, end_row);
     int row = e.first_row - 1, x = 0, last = -1;
-    // One flat loop over (splat, row, tile): lanes with small splats do not wait for lanes with large ones.
+    // One flat loop over (splat, row, tile): lanes with small splats do not wait for lanes with
+    // large ones.
     while (entry < end && rank < count) {
         x++;
         if (x > last) {
@@ -71,7 +77,7 @@ void main() {
             ivec2 interval = interval_of(e, row, tiles_x);
             x = interval.x;
             last = row <= e.last_row ? interval.y : -1;
-            // What lies before this lane's share belongs to others.
+            // Tiles before the share of this lane belong to other lanes.
             int skip = clamp(int(begin) - int(entry), 0, max(last - x + 1, 0));
             x += skip;
             entry += uint(skip);

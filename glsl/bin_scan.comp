@@ -1,6 +1,6 @@
 #version 450
 // subgroups: 4,8,16,32,64
-// Counts per tile to start offsets, by one subgroup; status learns the longest list.
+// Scans the counts per tile to start offsets, with one subgroup, and records the longest list.
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
 layout(local_size_x = SUBGROUP_SIZE) in;
@@ -22,6 +22,6 @@ void main() {
     }
     if (lane == 0) {
         tile_ranges[tiles] = carry;
-        status[2] = max(status[2], longest); // of all frames since it was read
+        status[2] = max(status[2], longest); // of all frames since the host cleared it
     }
 }

@@ -1,12 +1,14 @@
 #version 450
-// Grouping by counting, last step: every lane of bin_emit.comp moves its entries, in order, to where its share of each
-// tile's list begins. Reference: pass::bin.
+// Grouping by counting, last step: each lane of bin_emit.comp moves its entries, in order, to its
+// part of the list of each tile. Reference: pass::bin.
 layout(local_size_x = 8) in;
 
 layout(std430, binding = 0) readonly buffer EntryCount { uint entry_count; };
-layout(std430, binding = 1) readonly buffer Entries { uvec2 entries[]; };            // [capacity] (tile, splat)
-layout(std430, binding = 2) buffer Counters { uint counters[]; };                    // [tiles, lanes]: places
-layout(std430, binding = 3) writeonly buffer TileSplats { uvec2 tile_splats[]; };    // [capacity] (splat, entry)
+// [capacity] (tile, splat).
+layout(std430, binding = 1) readonly buffer Entries { uvec2 entries[]; };
+layout(std430, binding = 2) buffer Counters { uint counters[]; };  // [tiles, lanes] positions
+// [capacity] (splat, entry).
+layout(std430, binding = 3) writeonly buffer TileSplats { uvec2 tile_splats[]; };
 layout(push_constant) uniform Push { uint lanes; };
 
 void main() {

@@ -1,9 +1,11 @@
 #version 450
-// Sums of the parts of the camera gradient that project_backward.comp leaves, in a fixed order: a workgroup for each.
+// Sums the partial camera gradients in a fixed order, one workgroup per component.
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 0) readonly buffer CameraParts { float camera_parts[]; };  // [CAMERA_GRADIENTS, parts]
-layout(std430, binding = 1) writeonly buffer CameraGrad { float camera_grad[]; };   // [CAMERA_GRADIENTS]
+// [CAMERA_GRADIENTS, parts].
+layout(std430, binding = 0) readonly buffer CameraParts { float camera_parts[]; };
+// [CAMERA_GRADIENTS].
+layout(std430, binding = 1) writeonly buffer CameraGrad { float camera_grad[]; };
 layout(push_constant) uniform Push { uint parts; };
 
 shared float sums[64];

@@ -1,7 +1,8 @@
 #version 460
 // Zeroes the gradients by depth and by alpha in an upstream stack, for views without a depth loss.
 layout(local_size_x = 64) in;
-layout(std430, binding = 0) writeonly buffer Upstream { float upstream[]; };  // [4 + d + 1, H*W], the last by alpha
+// [4 + d + 1, H*W], the last by alpha.
+layout(std430, binding = 0) writeonly buffer Upstream { float upstream[]; };
 layout(push_constant) uniform Push { uint pixels; uint alpha_plane; };
 
 void main() {

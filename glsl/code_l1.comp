@@ -1,19 +1,24 @@
 #version 460
-// The language loss of one view: L1 between rendered features and the target code where there is a label
-// (docs/internals/method.md#language-loss).
-// Labels index rows of `codes`, all levels one after the other; -1 has no influence, not even on the gradient's bits.
-// mode 0: upstream = weight[level] * sign(F - code);  mode 1 (lifting): upstream = code, so that the backward pass
-// returns the blending-weighted sum of codes of every splat, and 1 for colour number `level` where there is a label, which
-// returns the blending weight itself;  mode 2 (least squares): upstream = F - code.
+// Language loss of one view: L1 between rendered features and the target code where there is a
+// label (docs/internals/method.md#language-loss). Labels index rows of `codes`, all levels one
+// after the other; -1 has no influence, not even on the bits of the gradient.
+// mode 0: upstream = weight[level] * sign(F - code).
+// mode 1 (lifting): upstream = code, so that the backward pass returns the blending-weighted sum of
+// codes of every splat, and 1 for colour number `level` where there is a label, which returns the
+// blending weight itself.
+// mode 2 (least squares): upstream = F - code.
 #extension GL_GOOGLE_include_directive : require
 #include "shared/layout.glsl"
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Labels { int labels[]; };  // [levels, H*W]
 layout(std430, binding = 1) readonly buffer Codes { float codes[]; };  // [K, width]
 layout(std430, binding = 2) readonly buffer Weights { float weights[]; };  // [levels]
-layout(std430, binding = 3) readonly buffer Planes { float planes[]; };  // [4 + levels*width, H*W]: RGB, depth, features
-layout(std430, binding = 4) writeonly buffer Upstream { float upstream[]; };  // [4 + levels*width + 1, H*W]
-layout(std430, binding = 5) writeonly buffer Loss { float loss[]; };  // [H*W] weighted sum over levels
+// [4 + levels*width, H*W]: RGB, depth, features.
+layout(std430, binding = 3) readonly buffer Planes { float planes[]; };
+// [4 + levels*width + 1, H*W].
+layout(std430, binding = 4) writeonly buffer Upstream { float upstream[]; };
+// [H*W] weighted sum over levels.
+layout(std430, binding = 5) writeonly buffer Loss { float loss[]; };
 layout(push_constant) uniform Push { uint pixels; uint levels; uint width; uint mode; };
 
 const uint LOSS = 0u;

@@ -1,6 +1,7 @@
 #version 450
 // subgroups: 4,8,16,32,64
-// Walks the tile lists exactly as raster_forward.comp does and counts what it evaluates and what it blends: for benchmarks.
+// Walks the tile lists exactly as raster_forward.comp does and counts the pairs that it evaluates
+// and those that it blends. For benchmarks.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require
@@ -8,10 +9,13 @@
 #extension GL_KHR_shader_subgroup_shuffle : require
 layout(local_size_x = SUBGROUP_SIZE) in;
 
-layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };    // [N, 3], see project.comp
-layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; }; // [tiles + 1]
-layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; }; // [capacity] (splat, entry)
-layout(std430, binding = 3) writeonly buffer Counts { uvec2 counts[]; };        // [tiles, 64] (evaluated, blended), zero at first
+// [N, 3], see project.comp.
+layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };
+layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };  // [tiles + 1]
+// [capacity] (splat, entry).
+layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };
+// [tiles, 64] (evaluated, blended), zero at first.
+layout(std430, binding = 3) writeonly buffer Counts { uvec2 counts[]; };
 layout(push_constant) uniform Push { uint width; uint height; uint tiles_x; };
 
 #define CHANNELS BASE_CHANNELS

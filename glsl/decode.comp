@@ -1,25 +1,27 @@
 #version 450
-// Code per pixel: k* = argmax_k F.c_k, ties to the lowest k. -1 where alpha < VOID_ALPHA,
-// and where |F| < MIN_FEATURE_SHARE alpha: splats without features are what the pixel shows.
-// Reference: pass::decode::decode_pixels.
+// Code per pixel: k* = argmax_k F.c_k, ties to the lowest k. -1 where alpha < VOID_ALPHA and where
+// |F| < MIN_FEATURE_SHARE alpha, since such a pixel shows splats without features. Reference:
+// pass::decode::decode_pixels.
 // variants: DIM=4,8,16,32
 #extension GL_EXT_control_flow_attributes : require
-// Every thread takes four pixels, so that each code is loaded once for four: on lavapipe a load costs as much as seven FMAs.
-// Pixels less opaque than this show nothing of the scene.
+// A pixel with a lower alpha has no code.
 const float VOID_ALPHA = 0.5;
-// Pixels whose feature is shorter than this share of their alpha have no code: surfaces continued beyond the photos carry no
-// features, and a blend of nothing has no code. Splat features are unit vectors, so |F| is the alpha they contribute, less
-// what differing codes cancel (sqrt(1/2) where two meet); a quarter separates that from stray contributions.
+// A pixel whose feature is shorter than this share of its alpha has no code: surfaces continued
+// beyond the photos carry no features. Splat features are unit vectors, so |F| is the alpha that
+// they contribute, less the cancellation between differing codes (a factor of sqrt(1/2) where two
+// meet); a quarter separates that from stray contributions.
 const float MIN_FEATURE_SHARE = 0.25;
 #include "shared/select.glsl"
+// Pixels per thread: each code is loaded once for four, since on lavapipe a load costs as much as
+// seven FMAs.
 #define PIXELS 4u
 #define QUADS (DIM / 4)
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer Features { float features[]; };  // planar [planes, P]
-layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; }; // [P]
-layout(std430, binding = 2) readonly buffer Codes { vec4 codes[]; };         // [K, DIM / 4], zero padded
-layout(std430, binding = 3) writeonly buffer Decoded { int decoded[]; };     // [P]
+layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; };  // [P]
+layout(std430, binding = 2) readonly buffer Codes { vec4 codes[]; };  // [K, DIM / 4], zero padded
+layout(std430, binding = 3) writeonly buffer Decoded { int decoded[]; };  // [P]
 // The features are planes first_plane .. first_plane + dim.
 layout(push_constant) uniform Push { uint pixels; uint count; uint dim; uint first_plane; };
 

@@ -1,11 +1,16 @@
 #version 460
-// Depth regulariser: weight * mean over confident pixels of |D - A d| / d, with D = sum w z and A = sum w as rendered and
-// d the stereo depth. Linear in D and A, so it is stable where little has been accumulated.
+// Gradient of the depth regulariser, weight * sum over confident pixels of |D - A d| / d. D =
+// sum w z and A = sum w are rendered, d is the stereo depth. Linear in D and A, so it is stable
+// where alpha is small.
 layout(local_size_x = 64) in;
-layout(std430, binding = 0) readonly buffer Reference { float reference[]; };  // [H*W] depth, 0 = no opinion
-layout(std430, binding = 1) readonly buffer Planes { float planes[]; };  // [4 + d, H*W]: RGB, sum w z, features
-layout(std430, binding = 2) readonly buffer Transmittance { float transmittance[]; };  // [H*W] 1 - A
-layout(std430, binding = 3) writeonly buffer Upstream { float upstream[]; };  // [4 + d + 1, H*W], the last by A
+// [H*W] depth, 0 = unknown.
+layout(std430, binding = 0) readonly buffer Reference { float reference[]; };
+// [4 + d, H*W]: RGB, sum w z, features.
+layout(std430, binding = 1) readonly buffer Planes { float planes[]; };
+// [H*W] 1 - A.
+layout(std430, binding = 2) readonly buffer Transmittance { float transmittance[]; };
+// [4 + d + 1, H*W], the last by A.
+layout(std430, binding = 3) writeonly buffer Upstream { float upstream[]; };
 layout(push_constant) uniform Push { uint pixels; uint alpha_plane; float weight; };
 
 void main() {

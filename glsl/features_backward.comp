@@ -1,5 +1,6 @@
 #version 450
-// Gradient by the rendered features to gradient by the stored ones, per block of `width` numbers. Reference: pass::project_backward::features_reference.
+// Gradient by the stored features from the gradient by the rendered ones, per block of `width`
+// numbers. Reference: pass::project_backward::features_reference.
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer Features { float features[]; };          // [N, dim]

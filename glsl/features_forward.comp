@@ -1,11 +1,12 @@
 #version 450
-// Stored features to rendered ones, per block of `width` numbers: f / (|f| + epsilon), or f where epsilon < 0
-// (docs/internals/method.md#feature-gauge).
-// Reference: pass::project::features_reference.
+// Rendered features from the stored ones, per block of `width` numbers: f / (|f| + epsilon), or f
+// where epsilon < 0 (docs/internals/method.md#feature-gauge). Reference:
+// pass::project::features_reference.
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 0) readonly buffer Features { float features[]; }; // [N, dim]
-layout(std430, binding = 1) writeonly buffer Codes { float codes[]; };      // [N, stride], zeros beyond dim
+layout(std430, binding = 0) readonly buffer Features { float features[]; };  // [N, dim]
+// [N, stride], zeros beyond dim.
+layout(std430, binding = 1) writeonly buffer Codes { float codes[]; };
 layout(push_constant) uniform Push { uint count; uint dim; uint stride; uint width; float epsilon; };
 
 void main() {

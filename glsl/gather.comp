@@ -1,5 +1,5 @@
 #version 460
-// Rows of a [N, stride] array by index: to[i] = from[index[i]]. Serves pruning for parameters and for optimiser state alike.
+// Rows of a [N, stride] array by index, to[i] = from[index[i]]: parameters and optimiser state.
 layout(local_size_x = 256) in;
 layout(std430, binding = 0) readonly buffer Index { uint index[]; };
 layout(std430, binding = 1) readonly buffer From { uint from[]; };

@@ -1,18 +1,20 @@
 #version 450
-// Planes of a rendered frame to texels as hosts want them. Reference: pass::pack.
+// Packs planes of a rendered frame into texels of a chosen encoding. Reference: pass::pack.
 layout(local_size_x = 128) in;
 
 layout(std430, binding = 0) readonly buffer Planes { float planes[]; };              // [C, stride]
 layout(std430, binding = 1) readonly buffer Transmittance { float transmittance[]; }; // [stride]
-layout(std430, binding = 2) writeonly buffer Texels { uint texels[]; };              // [layers, P, group] in `encoding`
+// [layers, P, group] in `encoding`.
+layout(std430, binding = 2) writeonly buffer Texels { uint texels[]; };
 // source 0: colour and alpha, 1: alpha, 2: expected depth, 3: `channels` planes from `first` on.
-// encoding 0: 32-bit float, 1: 16-bit float, 2: 8-bit unorm; 1 and 2 with groups of four.
-// `count` pixels from `from` on of the planes, pixels `to` and following of the `pixels` of the texels.
+// encoding 0: 32-bit float, 1: 16-bit float, 2: 8-bit unorm; 1 and 2 with groups of four. Packs
+// `count` pixels of the planes from `from` on, to the texels from `to` on, of `pixels` in all.
 layout(push_constant) uniform Push {
     uint pixels; uint source; uint first; uint channels; uint group; uint encoding; uint stride; uint from; uint to; uint count;
 };
 
-// Below, the sum of w z says little about any surface (docs/internals/method.md#forward-rasterisation).
+// Least alpha with a depth: below it the sum of w z describes no surface
+// (docs/internals/method.md#forward-rasterisation).
 const float DEPTH_ALPHA_MIN = 0.5;
 
 float value(uint pixel, uint k) {

@@ -1,5 +1,5 @@
 #version 450
-// Initial sweep: per pixel the best of push.planes inverse depths over the range, each with a random normal.
+// Initial sweep: per pixel the best of push.planes inverse depths, each with a random normal.
 #extension GL_GOOGLE_include_directive : require
 #include "shared/plane_sweep.glsl"
 layout(local_size_x = 16, local_size_y = 4) in;

@@ -1,6 +1,7 @@
 #version 450
-// One propagation and refinement step over one colour of the red-black checkerboard (Xu and Tao 2019, ACMM, 3.1): per
-// pixel the present plane, the best plane of eight areas around it, then four random changes; the cheapest is kept.
+// One propagation and refinement step over one colour of the red-black checkerboard (Xu and Tao
+// 2019, ACMM, 3.1): per pixel the present plane, the best plane of each of eight areas around it,
+// then four random changes; the plane of lowest cost is kept.
 #extension GL_GOOGLE_include_directive : require
 #include "shared/plane_sweep.glsl"
 layout(local_size_x = 16, local_size_y = 4) in;
@@ -16,7 +17,8 @@ void consider(ivec2 p) {
     }
 }
 
-// Lowest cost in an area (0-3: a near wedge per direction, 4-7: a far strip per direction); w = 3.4e38 outside.
+// Plane of lowest cost in an area (0-3: a near wedge per direction, 4-7: a far strip per
+// direction); w = 3.4e38 outside.
 void search_area(ivec2 p, int area) {
     area_best = vec4(0.0, 0.0, 0.0, 3.4e38);
     int direction = area & 3;
@@ -47,7 +49,7 @@ void main() {
     start_random(p);
     uint here = push.first + uint(p.y) * push.width + uint(p.x);
     vec4 best = vec4(planes[here].xyz, 3.4e38);
-    // 0: the present plane, 1-8: areas, 9-12: random changes. One loop, so that the cost is compiled once.
+    // 0: the present plane, 1-8: areas, 9-12: random changes. One loop compiles the cost once.
     for (int h = 0; h < 13; h++) {
         vec3 candidate = best.xyz;
         bool valid = h == 0;

@@ -1,18 +1,21 @@
 #version 450
 // variants: SH_DEGREE=0,1,2,3
-// Projects splats to the screen and writes their depth sort keys. Equations and reference: pass::project.
+// Projects splats to the screen and writes their depth sort keys. Equations and reference:
+// pass::project.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 1) readonly buffer Means { float means[]; };                    // [N, 3]
-layout(std430, binding = 2) readonly buffer LogScales { float log_scales[]; };           // [N, 3]
-layout(std430, binding = 3) readonly buffer Quats { vec4 quats[]; };                     // [N]
-layout(std430, binding = 4) readonly buffer OpacityLogits { float opacity_logits[]; };   // [N]
-layout(std430, binding = 5) readonly buffer Sh { float sh[]; };                          // [N, sh_stride, 3]
-// [N, 3]: (u, v, A', B'), (C', log2 o, A'C' − B'²/4, 0), (r, g, b, z), log2(o e^p) = A' dx² + B' dx dy + C' dy² + log2 o
+layout(std430, binding = 1) readonly buffer Means { float means[]; };  // [N, 3]
+layout(std430, binding = 2) readonly buffer LogScales { float log_scales[]; };  // [N, 3]
+layout(std430, binding = 3) readonly buffer Quats { vec4 quats[]; };  // [N]
+layout(std430, binding = 4) readonly buffer OpacityLogits { float opacity_logits[]; };  // [N]
+layout(std430, binding = 5) readonly buffer Sh { float sh[]; };  // [N, sh_stride, 3]
+// [N, 3]: (u, v, A', B'), (C', log2 o, A'C' − B'²/4, 0), (r, g, b, z), with
+//   log2(o e^p) = A' dx² + B' dx dy + C' dy² + log2 o
 layout(std430, binding = 6) writeonly buffer Projected { vec4 projected[]; };
-layout(std430, binding = 7) writeonly buffer DepthPairs { uvec2 depth_pairs[]; };        // [N] (sort key, splat)
+// [N] (sort key, splat).
+layout(std430, binding = 7) writeonly buffer DepthPairs { uvec2 depth_pairs[]; };
 layout(push_constant) uniform Push { uint count; uint sh_stride; uint antialiased; };
 
 #include "shared/camera.glsl"
@@ -28,7 +31,7 @@ void main() {
     if (i >= count) return;
     vec3 mean = vec3(means[3 * i], means[3 * i + 1], means[3 * i + 2]);
     Geometry g = geometry_of(mean, vec3(log_scales[3 * i], log_scales[3 * i + 1], log_scales[3 * i + 2]), quats[i]);
-    // exp(80) is still finite, so an extreme logit gives a tiny opacity and not a NaN.
+    // exp(80) is finite, so an extreme logit gives a tiny opacity and not a NaN.
     float log2_opacity = -log2(1.0 + exp(min(-opacity_logits[i], 80.0)));
 
     if (antialiased != 0) log2_opacity += 0.5 * log2(max(dot(g.area, g.area), SMALLEST_AREA) * g.conic_det);
@@ -45,9 +48,10 @@ void main() {
     bool visible = g.visible && log2_opacity >= LOG2_ALPHA_MIN;
     vec2 centre = camera_focal() * g.t.xy / g.t.z + camera_centre() - 0.5;
     vec3 power = vec3(-0.5 * LOG2_E, -LOG2_E, -0.5 * LOG2_E) * g.conic;
-    // A splat that is not visible must fail every comparison downstream: far below any opacity.
+    // A log opacity of -1e4 makes an invisible splat fail every later comparison.
     projected[PROJECTED_VECTORS * i] = vec4(centre, power.xy);
     projected[PROJECTED_VECTORS * i + 1] = vec4(power.z, visible ? log2_opacity : -1e4, 0.25 * LOG2_E * LOG2_E * g.conic_det, 0.0);
     projected[PROJECTED_VECTORS * i + 2] = vec4(colour, g.t.z);
-    depth_pairs[i] = uvec2(visible ? floatBitsToUint(g.t.z) : 0xffffffffu, i); // positive floats sort like integers
+    // Positive floats sort like their bits.
+    depth_pairs[i] = uvec2(visible ? floatBitsToUint(g.t.z) : 0xffffffffu, i);
 }

@@ -1,24 +1,26 @@
 #version 450
 // variants: SH_DEGREE=0,1,2,3
-// Gradients of the raw splat parameters and of the camera. Equations and reference: pass::project_backward.
+// Gradients of the raw splat parameters and of the camera. Equations and reference:
+// pass::project_backward.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_arithmetic : require
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 1) readonly buffer Means { float means[]; };                   // [N, 3]
-layout(std430, binding = 2) readonly buffer LogScales { float log_scales[]; };          // [N, 3]
-layout(std430, binding = 3) readonly buffer Quats { vec4 quats[]; };                    // [N]
+layout(std430, binding = 1) readonly buffer Means { float means[]; };  // [N, 3]
+layout(std430, binding = 2) readonly buffer LogScales { float log_scales[]; };  // [N, 3]
+layout(std430, binding = 3) readonly buffer Quats { vec4 quats[]; };  // [N]
 layout(std430, binding = 4) readonly buffer OpacityLogits { float opacity_logits[]; };  // [N]
-layout(std430, binding = 5) readonly buffer Sh { float sh[]; };                         // [N, sh_stride, 3]
-layout(std430, binding = 6) readonly buffer ProjectedGrad { vec4 projected_grad[]; };   // [N, 3]
-layout(std430, binding = 7) writeonly buffer MeansGrad { float means_grad[]; };         // shapes as above
+layout(std430, binding = 5) readonly buffer Sh { float sh[]; };  // [N, sh_stride, 3]
+layout(std430, binding = 6) readonly buffer ProjectedGrad { vec4 projected_grad[]; };  // [N, 3]
+layout(std430, binding = 7) writeonly buffer MeansGrad { float means_grad[]; };  // shapes as above
 layout(std430, binding = 8) writeonly buffer LogScalesGrad { float log_scales_grad[]; };
 layout(std430, binding = 9) writeonly buffer QuatsGrad { vec4 quats_grad[]; };
 layout(std430, binding = 10) writeonly buffer OpacityLogitsGrad { float opacity_logits_grad[]; };
 layout(std430, binding = 11) writeonly buffer ShGrad { float sh_grad[]; };
-layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };    // [CAMERA_GRADIENTS, workgroups]
+// [CAMERA_GRADIENTS, workgroups].
+layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };
 layout(push_constant) uniform Push { uint count; uint sh_stride; uint antialiased; };
 
 #include "shared/camera.glsl"
@@ -26,10 +28,10 @@ layout(push_constant) uniform Push { uint count; uint sh_stride; uint antialiase
 #include "shared/sh.glsl"
 #include "shared/splat.glsl"
 
-// The camera gradient of each subgroup: at most 16, of 4 threads.
+// Camera gradient of each subgroup: at most 16 subgroups, of 4 threads.
 shared float by_camera[CAMERA_GRADIENTS][16];
 
-// Through the conic: rows of ∂B = 2 G' B.
+// Gradient through the conic: rows of ∂B = 2 G' B.
 void covariance_backward(Geometry g, vec3 by_conic, out vec3 by_b0, out vec3 by_b1) {
     mat2 q = mat2(g.conic.x, g.conic.y, g.conic.y, g.conic.z);
     mat2 by_sigma = -(q * mat2(by_conic.x, 0.5 * by_conic.y, 0.5 * by_conic.y, by_conic.z) * q);
@@ -37,7 +39,8 @@ void covariance_backward(Geometry g, vec3 by_conic, out vec3 by_b0, out vec3 by_
     by_b1 = 2.0 * (g.b0 * by_sigma[0][1] + g.b1 * by_sigma[1][1]);
 }
 
-// Through the opacity of antialiased splats, by its logarithm: ∂ ln √(det BBᵀ / det Σ') = (BBᵀ)⁻¹ B − Σ'⁻¹ B.
+// Gradient through the logarithm of the opacity of antialiased splats:
+//   ∂ ln √(det BBᵀ / det Σ') = (BBᵀ)⁻¹ B − Σ'⁻¹ B
 void filter_backward(Geometry g, float by_log_opacity, inout vec3 by_b0, inout vec3 by_b1) {
     float inv = 1.0 / max(dot(g.area, g.area), SMALLEST_AREA), xy = dot(g.b0, g.b1);
     vec3 own = vec3(dot(g.b1, g.b1) * inv, -xy * inv, dot(g.b0, g.b0) * inv) - g.conic;
@@ -45,7 +48,8 @@ void filter_backward(Geometry g, float by_log_opacity, inout vec3 by_b0, inout v
     by_b1 += by_log_opacity * (own.y * g.b0 + own.z * g.b1);
 }
 
-// Through one coordinate of the centre and one row of the Jacobian; adds to ∂t and to the intrinsics.
+// Gradient through one coordinate of the centre and one row of the Jacobian; adds to ∂t and to the
+// gradient by the intrinsics.
 void axis_backward(int axis, Geometry g, float by_centre, vec3 by_j, inout vec3 by_t, inout vec4 by_intrinsics) {
     float f = camera_focal()[axis], inv_z = 1.0 / g.t.z;
     float ratio = g.clamped[axis] * inv_z;
@@ -75,7 +79,8 @@ vec4 quat_backward(Geometry g, mat3 m) { // m = ∂R_q, m[col][row]
     return (by_unit - g.quat * dot(g.quat, by_unit)) / g.quat_length;
 }
 
-// ∂RGB to the SH coefficients (written) and to the mean through the viewing direction (returned, world axes).
+// Writes the gradient by the SH coefficients and returns that by the mean through the viewing
+// direction, world axes.
 vec3 colour_backward(uint i, vec3 mean, vec3 by_colour) {
     vec3 offset = mean - camera_position();
     float distance = length(offset);
@@ -102,7 +107,8 @@ vec3 colour_backward(uint i, vec3 mean, vec3 by_colour) {
     return (by_direction - direction * dot(direction, by_direction)) / distance;
 }
 
-// Each thread walks the splats in steps of all threads, so that few parts of the camera gradient are left to sum.
+// Each thread walks the splats with a stride of all threads, so that there are few partial camera
+// gradients to sum.
 void main() {
     uint threads = gl_NumWorkGroups.x * gl_WorkGroupSize.x;
     vec3 by_rho = vec3(0.0), by_theta = vec3(0.0);
@@ -111,7 +117,8 @@ void main() {
         vec3 mean = vec3(means[3 * i], means[3 * i + 1], means[3 * i + 2]);
         vec3 log_scale = vec3(log_scales[3 * i], log_scales[3 * i + 1], log_scales[3 * i + 2]);
         Geometry g = geometry_of(mean, log_scale, quats[i]);
-        float up[MOMENTS + BASE_CHANNELS]; // a splat that no pixel saw has zeros here, and gets zero gradients below
+        // Zeros for a splat without pixels, whose gradients then are zero.
+        float up[MOMENTS + BASE_CHANNELS];
         [[unroll]] for (int k = 0; k < MOMENTS + BASE_CHANNELS; k++) up[k] = projected_grad[GRADIENT_VECTORS * i + k / 4][k % 4];
 
         float opacity = 1.0 / (1.0 + exp(min(-opacity_logits[i], 80.0)));
@@ -141,7 +148,8 @@ void main() {
         means_grad[3 * i + 1] = by_mean.y;
         means_grad[3 * i + 2] = by_mean.z;
 
-        mat3 turn = outerProduct(g.j0, by_j0) + outerProduct(g.j1, by_j1); // Jᵀ ∂J, turn[col][row]
+        // Jᵀ ∂J, turn[col][row].
+        mat3 turn = outerProduct(g.j0, by_j0) + outerProduct(g.j1, by_j1);
         if (g.visible) {
             by_rho += by_t + to_camera_axes(by_mean_colour);
             by_theta += cross(g.t, by_t) + vec3(turn[1][2] - turn[2][1], turn[2][0] - turn[0][2], turn[0][1] - turn[1][0]);

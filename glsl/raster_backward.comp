@@ -1,7 +1,7 @@
 #version 450
 // variants: CHANNELS=4,7,12,16,20
 // subgroups: 4,8,16,32,64
-// Gradients by the screen-space splats, added up by float atomics.
+// Gradients by the screen-space splats, summed by float atomics.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require

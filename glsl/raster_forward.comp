@@ -10,19 +10,22 @@
 #include "shared/layout.glsl"
 layout(local_size_x = SUBGROUP_SIZE) in;
 
-layout(std430, binding = 1) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
-layout(std430, binding = 2) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
-layout(std430, binding = 3) readonly buffer TileSplats { uvec2 tile_splats[]; };  // [capacity] (splat, entry)
+// [N, 3], see project.comp.
+layout(std430, binding = 1) readonly buffer Projected { vec4 projected[]; };
+layout(std430, binding = 2) readonly buffer TileRanges { uint tile_ranges[]; };  // [tiles + 1]
+// [capacity] (splat, entry).
+layout(std430, binding = 3) readonly buffer TileSplats { uvec2 tile_splats[]; };
 #if CHANNELS != BASE_CHANNELS
-layout(std430, binding = 4) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
+layout(std430, binding = 4) readonly buffer Codes { vec4 codes[]; };  // [N, code_vectors]
 #endif
-layout(std430, binding = 5) writeonly buffer Planes { float planes[]; };          // [4 + d, H, W]
+layout(std430, binding = 5) writeonly buffer Planes { float planes[]; };  // [4 + d, H, W]
 #if CHANNELS != 16
-layout(std430, binding = 6) writeonly buffer Transmittance { float transmittances[]; }; // [H, W]
+layout(std430, binding = 6) writeonly buffer Transmittance { float transmittances[]; };  // [H, W]
 #endif
-// `planes` hold `rows` rows of the image, from row `top` on. The dispatch begins at row `first_row` of the image's tiles,
-// the lists at row `list_row`. Features of this block start at vector first_vector of a splat's code and fill `features` planes from
-// first_plane + (4 if the block has RGB and depth).
+// `planes` hold `rows` rows of the image, from row `top` on. The dispatch begins at row `first_row`
+// of the tiles of the image, the lists at row `list_row`. Features of this block start at vector
+// first_vector of the code of a splat and fill `features` planes from first_plane + (4 if the block
+// has RGB and depth).
 layout(push_constant) uniform Push {
     uint width; uint top; uint rows; uint first_row; uint list_row;
     uint tiles_x; uint code_vectors; uint first_vector; uint first_plane; uint features;
@@ -39,7 +42,7 @@ void main() {
     vec2 origin = vec2(corner);
     uint first = tile_ranges[tile], last = tile_ranges[tile + 1];
 
-    // Negative T marks a pixel that has stopped; pixels beyond the border never start.
+    // A negative T marks a pixel that has stopped, as are pixels beyond the border from the start.
     float T[PIXELS], sum[CHANNELS * PIXELS];
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;

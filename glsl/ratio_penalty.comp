@@ -1,6 +1,7 @@
 #version 460
-// Adds the gradient of weight * max(0, s_max/s_min - limit) per splat to the log-scale gradients: needles grow where only
-// a few views constrain a splat. The ratio is capped in the gradient so that one degenerate splat cannot overflow.
+// Adds the gradient of weight * max(0, s_max/s_min - limit) per splat to the log-scale gradients:
+// without it, splats that few views constrain become needles. The ratio is capped in the gradient
+// so that one degenerate splat cannot overflow.
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer LogScales { float log_scales[]; };  // [N, 3]
 layout(std430, binding = 1) buffer Gradients { float gradients[]; };  // [N, 3]

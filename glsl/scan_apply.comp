@@ -1,11 +1,12 @@
 #version 450
-// Exclusive scan, step 3 of 3: every lane walks its chunk again from its start.
+// Exclusive scan, step 3 of 3: every lane scans its chunk from its start.
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 0) readonly buffer Values { uint values[]; };   // [N]
-layout(std430, binding = 1) readonly buffer Count { uint count; };       // N
-layout(std430, binding = 2) readonly buffer Sums { uint sums[]; };       // [lanes] starts
-layout(std430, binding = 3) writeonly buffer Starts { uint starts[]; };  // [N] sum of all values before
+layout(std430, binding = 0) readonly buffer Values { uint values[]; };  // [N]
+layout(std430, binding = 1) readonly buffer Count { uint count; };  // N
+layout(std430, binding = 2) readonly buffer Sums { uint sums[]; };  // [lanes] starts
+// [N] sum of all values before.
+layout(std430, binding = 3) writeonly buffer Starts { uint starts[]; };
 layout(push_constant) uniform Push { uint lanes; };
 
 void main() {

@@ -1,10 +1,10 @@
 #version 450
-// Exclusive scan, step 2 of 3: the lanes' sums become their starts; the grand total goes behind them.
+// Exclusive scan, step 2 of 3: turns the sums of the lanes into their starts and writes the total.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 256) in;
 
-layout(std430, binding = 0) buffer Sums { uint sums[]; };              // [lanes] sums in, starts out
-layout(std430, binding = 1) writeonly buffer Total { uint total; };    // sum of everything
+layout(std430, binding = 0) buffer Sums { uint sums[]; };  // [lanes] sums in, starts out
+layout(std430, binding = 1) writeonly buffer Total { uint total; };  // sum of everything
 layout(push_constant) uniform Push { uint lanes; };                    // a multiple of 256
 
 const uint BLOCK = 8;
@@ -27,7 +27,7 @@ void main() {
         barrier();
     }
     uint start = totals[side][thread] - own;
-    // A load after a store to the same buffer waits for it: a block at a time is loaded, then stored.
+    // A load after a store to the same buffer waits for it: each block is loaded, then stored.
     for (uint i = 0u; i < each; i += BLOCK) {
         uint block[BLOCK];
         [[unroll]] for (uint k = 0u; k < BLOCK; k++) block[k] = i + k < each ? sums[first + i + k] : 0u;

@@ -1,8 +1,9 @@
 #version 450
-// One-sweep radix sort, step 2 of 3: where the elements with each digit begin. One workgroup per pass.
+// OneSweep radix sort, step 2 of 3: exclusive scan of the digit histograms. One workgroup per pass.
 layout(local_size_x = 256) in;
 
-layout(std430, binding = 0) buffer Digits { uint digits[]; }; // [passes, 256] counts in, places out
+// [passes, 256] counts in, positions out.
+layout(std430, binding = 0) buffer Digits { uint digits[]; };
 
 shared uint sums[2][256];
 

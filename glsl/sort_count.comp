@@ -1,7 +1,10 @@
 #version 450
-// Radix sort, step 1 of 3: every lane counts the digits of its own contiguous chunk. Contiguous chunks, one per lane, with
-// private counters need neither atomics nor barriers, are stable by construction and do not depend on the subgroup size.
-layout(local_size_x = 8) in; // 8 lanes x 256 counters fill 8 KiB of shared memory; lavapipe's subgroup is 8 wide
+// Radix sort in chunks, step 1 of 3: every lane counts the digits of its own contiguous chunk.
+// Contiguous chunks, one per lane, with private counters need neither atomics nor barriers, are
+// stable by construction and do not depend on the subgroup size.
+//
+// 8 lanes x 256 counters fill 8 KiB of shared memory; lavapipe's subgroup is 8 wide.
+layout(local_size_x = 8) in;
 
 layout(std430, binding = 0) readonly buffer Pairs { uvec2 pairs[]; };            // [N] (key, value)
 layout(std430, binding = 1) readonly buffer Count { uint count; };               // N

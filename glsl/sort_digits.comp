@@ -1,5 +1,5 @@
 #version 450
-// One-sweep radix sort, step 1 of 3: how often every digit of every pass occurs, in one read of the keys.
+// OneSweep radix sort, step 1 of 3: digit histograms of all passes, in one read of the keys.
 layout(local_size_x = 256) in;
 
 layout(std430, binding = 0) readonly buffer Pairs { uvec2 pairs[]; };   // [N] (key, value)
@@ -7,7 +7,7 @@ layout(std430, binding = 1) readonly buffer Count { uint count; };      // N
 layout(std430, binding = 2) buffer Digits { uint digits[]; };           // [4, 256], zero at first
 layout(push_constant) uniform Push { uint mask; uint passes; };
 
-const uint EACH = 32; // pairs per thread: enough that the 1024 sums at the end cost little
+const uint PAIRS_PER_THREAD = 32; // so many that the 1024 sums at the end cost little
 
 shared uint counters[4 * 256];
 
@@ -16,8 +16,8 @@ void main() {
     for (uint pass = 0u; pass < passes; pass++) counters[pass * 256u + thread] = 0u;
     barrier();
     uint group = gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x;
-    for (uint i = 0u; i < EACH; i++) {
-        uint index = (group * EACH + i) * 256u + thread;
+    for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
+        uint index = (group * PAIRS_PER_THREAD + i) * 256u + thread;
         if (index < count) {
             uint key = pairs[index].x & mask;
             for (uint pass = 0u; pass < passes; pass++) {

@@ -1,7 +1,7 @@
 #version 450
-// Radix sort, step 2 of 3: counts become the place of each lane's first element per digit, in place: digits in order, and
-// within a digit lanes in order. One thread per digit walks the lanes; one workgroup, so that digit totals meet in
-// shared memory.
+// Radix sort in chunks, step 2 of 3: turns the counts, in place, into the position of the first
+// element of each lane per digit: digits in order, and within a digit lanes in order. One thread
+// per digit walks the lanes; one workgroup, so that the totals of the digits meet in shared memory.
 layout(local_size_x = 256) in;
 
 layout(std430, binding = 0) buffer Histogram { uint histogram[]; }; // [lanes, 256]

@@ -1,11 +1,12 @@
 #version 450
-// Radix sort, step 3 of 3: every lane moves its chunk, in order, to the places step 2 gave it.
+// Radix sort in chunks, step 3 of 3: every lane moves its chunk, in order.
 layout(local_size_x = 8) in; // as in step 1
 
-layout(std430, binding = 0) readonly buffer Pairs { uvec2 pairs[]; };         // [N] (key, value)
-layout(std430, binding = 1) readonly buffer Count { uint count; };            // N
-layout(std430, binding = 2) readonly buffer Histogram { uint histogram[]; };  // [lanes, 256] places
-layout(std430, binding = 3) writeonly buffer Sorted { uvec2 sorted[]; };      // [N]
+layout(std430, binding = 0) readonly buffer Pairs { uvec2 pairs[]; };  // [N] (key, value)
+layout(std430, binding = 1) readonly buffer Count { uint count; };  // N
+// [lanes, 256] positions.
+layout(std430, binding = 2) readonly buffer Histogram { uint histogram[]; };
+layout(std430, binding = 3) writeonly buffer Sorted { uvec2 sorted[]; };  // [N]
 layout(push_constant) uniform Push { uint shift; uint mask; uint lanes; };
 
 shared uint places[256 * 8];

@@ -1,9 +1,15 @@
 #version 450
 // subgroups: 4,8,16,32,64
-// One-sweep radix sort, step 3 of 3, once per digit: ranks a tile of pairs, learns from the tiles before it where its
-// digits begin, and writes the pairs in order, so that neighbours write neighbours. Every pair is read once and written
-// once. Tiles are numbered in the order in which workgroups start, so that those before a tile are running or done; it looks
-// for what they tell a while and then counts for itself, since Vulkan does not promise that they go on meanwhile.
+// OneSweep radix sort, step 3 of 3, once per digit place (Adinets and Merrill 2022, "Onesweep: A
+// Faster Least Significant Digit Radix Sort for GPUs"). Each workgroup ranks one partition tile,
+// publishes its aggregate (count) of every digit, finds the exclusive prefix of every digit over
+// all preceding tiles by decoupled look-back, publishes the inclusive prefix, and scatters its
+// pairs in order. Every pair is read once and written once.
+//
+// Workgroups take tile numbers in the order in which they start, so all preceding tiles are running
+// or done. Vulkan does not guarantee forward progress between workgroups, however: a running
+// predecessor may stand still while this workgroup spins. After MAX_SPINS failed polls the
+// workgroup therefore counts the digit of a predecessor itself.
 #extension GL_KHR_shader_subgroup_basic : require
 #extension GL_KHR_shader_subgroup_ballot : require
 #extension GL_KHR_shader_subgroup_shuffle : require
@@ -11,31 +17,35 @@ layout(local_size_x = 8 * SUBGROUP_SIZE) in;
 
 layout(std430, binding = 0) readonly buffer Pairs { uvec2 pairs[]; };         // [N] (key, value)
 layout(std430, binding = 1) readonly buffer Count { uint count; };            // N
-layout(std430, binding = 2) readonly buffer Digits { uint digits[]; };        // [passes, 256] places
-layout(std430, binding = 3) buffer Tiles { uint tiles[]; };                   // [passes, stride], zero at first: tiles begun, and what each tile tells
+layout(std430, binding = 2) readonly buffer Digits { uint digit_bases[]; };   // [passes, 256]
+// [passes, stride], zero at first: the next tile number, then the status of each (tile, digit).
+layout(std430, binding = 3) buffer Tiles { uint tile_status[]; };
 layout(std430, binding = 4) writeonly buffer Sorted { uvec2 sorted[]; };      // [N]
 layout(push_constant) uniform Push { uint pass; uint mask; uint stride; };
 
 const uint SUBGROUPS = 8;
 const uint THREADS = SUBGROUPS * SUBGROUP_SIZE;
 const uint TILE = 2048;
-const uint EACH = TILE / THREADS;
-// What a tile tells of a digit: its own count, or the count of all tiles up to and with it; 0 = nothing yet.
-const uint OWN = 1u << 30, UP_TO_HERE = 2u << 30, VALUE = OWN - 1u;
+const uint PAIRS_PER_THREAD = TILE / THREADS;
+// Status of a (tile, digit): a flag and a count. The count is the aggregate of the tile, or the
+// inclusive prefix over the tile and all preceding ones; 0 = not published yet.
+const uint FLAG_AGGREGATE = 1u << 30, FLAG_INCLUSIVE = 2u << 30, COUNT_MASK = FLAG_AGGREGATE - 1u;
 
-// Looks in vain before a digit of a tile is counted here. A tile takes some microseconds and a look a fraction of one, so that no GPU
-// comes near; lavapipe leaves a shader's loops after 65535 rounds in all, which it did where the system had put the other tile's thread aside.
-const uint PATIENCE = 1000u;
+// Failed polls per digit before the predecessor is counted here. A tile takes some microseconds and
+// a poll a fraction of one, so no GPU reaches this number. Lavapipe leaves the loops of a shader
+// after 65535 rounds in all, which happened where the system had suspended the thread of the
+// predecessor.
+const uint MAX_SPINS = 1000u;
 
-shared uint begun;
-shared uint counters[SUBGROUPS * 256]; // per subgroup: counts, then where its pairs of a digit begin among the tile's
-shared uint totals[256];               // of the tile
+shared uint next_tile;
+shared uint counters[SUBGROUPS * 256]; // per subgroup and digit: counts, then offsets in the tile
+shared uint aggregates[256];
 shared uint sums[2][256];
-shared uint offsets[256];              // place in `sorted` less place in the tile
+shared uint offsets[256];              // position in `sorted` minus position in the tile
 shared uvec2 staged[TILE];
 
-// Pairs of a tile before this one, which is full, that have a digit.
-uint counted(uint tile, uint digit) {
+// Aggregate of one digit of a preceding tile, which is always full.
+uint count_digit(uint tile, uint digit) {
     uint n = 0u;
     for (uint i = tile * TILE; i < (tile + 1u) * TILE; i += 8u) {
         uvec4 a = uvec4(pairs[i].x, pairs[i + 1u].x, pairs[i + 2u].x, pairs[i + 3u].x);
@@ -50,23 +60,23 @@ uint counted(uint tile, uint digit) {
 void main() {
     uint thread = gl_LocalInvocationID.x;
     uint lane = gl_SubgroupInvocationID;
-    uint subgroup = gl_SubgroupID; // a device may deal threads to subgroups in any order
-    uint told_at = pass * stride + 1u; // what the tiles of this pass tell
-    if (thread == 0u) begun = atomicAdd(tiles[told_at - 1u], 1u);
+    uint subgroup = gl_SubgroupID; // a device may assign threads to subgroups in any order
+    uint status_base = pass * stride + 1u;
+    if (thread == 0u) next_tile = atomicAdd(tile_status[status_base - 1u], 1u);
     for (uint i = thread; i < SUBGROUPS * 256u; i += THREADS) counters[i] = 0u;
     barrier();
-    uint tile = begun;
+    uint tile = next_tile;
     uint first = tile * TILE;
 
-    // Ranks among the subgroup's pairs of the same digit, in order of index. What lies behind the end counts as the last
-    // digit: being last in order, it displaces nothing.
-    uvec2 own[EACH];
-    uint ranks[EACH];
-    // A shift by 32 is undefined: whole words stand by themselves.
+    // Ranks among the pairs of the subgroup with the same digit, in order of index. Pairs beyond
+    // the end get the last digit: they are last in order and displace no other pair.
+    uvec2 own[PAIRS_PER_THREAD];
+    uint ranks[PAIRS_PER_THREAD];
+    // A shift by 32 is undefined, so whole words are special cases.
     uvec2 all = uvec2(SUBGROUP_SIZE < 32 ? (1u << (SUBGROUP_SIZE % 32)) - 1u : ~0u, SUBGROUP_SIZE < 64 ? 0u : ~0u);
     uvec2 before = lane < 32u ? uvec2((1u << lane) - 1u, 0u) : uvec2(~0u, (1u << (lane - 32u)) - 1u);
-    for (uint i = 0u; i < EACH; i++) {
-        uint index = first + (subgroup * EACH + i) * SUBGROUP_SIZE + lane;
+    for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
+        uint index = first + (subgroup * PAIRS_PER_THREAD + i) * SUBGROUP_SIZE + lane;
         own[i] = index < count ? pairs[index] : uvec2(~0u);
         uint digit = index < count ? ((own[i].x & mask) >> (8u * pass)) & 255u : 255u;
         uvec2 peers = all;
@@ -83,7 +93,8 @@ void main() {
     }
     barrier();
 
-    // Tell the counts as early as possible, then add them up: over subgroups, over digits.
+    // Publishes the aggregates as early as possible, then scans the counts over subgroups and
+    // digits.
     for (uint digit = thread; digit < 256u; digit += THREADS) {
         uint total = 0u;
         for (uint s = 0u; s < SUBGROUPS; s++) {
@@ -91,9 +102,12 @@ void main() {
             counters[s * 256u + digit] = total;
             total += here;
         }
-        totals[digit] = total;
+        aggregates[digit] = total;
         sums[0][digit] = total;
-        if (first < count) atomicOr(tiles[told_at + tile * 256u + digit], tile == 0u ? UP_TO_HERE | total : OWN | total);
+        if (first < count) {
+            atomicOr(tile_status[status_base + tile * 256u + digit],
+                     tile == 0u ? FLAG_INCLUSIVE | total : FLAG_AGGREGATE | total);
+        }
     }
     barrier();
     uint side = 0u;
@@ -107,38 +121,41 @@ void main() {
         barrier();
     }
     for (uint digit = thread; digit < 256u; digit += THREADS) {
-        uint start = sums[side][digit] - totals[digit];
+        uint start = sums[side][digit] - aggregates[digit];
         for (uint s = 0u; s < SUBGROUPS; s++) counters[s * 256u + digit] += start;
-        uint earlier = 0u;
+        uint exclusive_prefix = 0u;
         if (first < count && tile > 0u) {
-            uint look = tile - 1u;
-            uint told = 0u;
-            uint vain = 0u;
-            while ((told & UP_TO_HERE) == 0u) {
-                told = atomicOr(tiles[told_at + look * 256u + digit], 0u);
-                if (told == 0u && ++vain > PATIENCE) told = counted(look, digit) | (look == 0u ? UP_TO_HERE : OWN);
-                if (told != 0u) {
-                    earlier += told & VALUE;
-                    look -= 1u;
+            uint predecessor = tile - 1u;
+            uint status = 0u;
+            uint spins = 0u;
+            while ((status & FLAG_INCLUSIVE) == 0u) {
+                status = atomicOr(tile_status[status_base + predecessor * 256u + digit], 0u);
+                if (status == 0u && ++spins > MAX_SPINS) {
+                    status = count_digit(predecessor, digit) |
+                             (predecessor == 0u ? FLAG_INCLUSIVE : FLAG_AGGREGATE);
+                }
+                if (status != 0u) {
+                    exclusive_prefix += status & COUNT_MASK;
+                    predecessor -= 1u;
                 }
             }
-            // OWN | total becomes UP_TO_HERE | earlier + total.
-            atomicAdd(tiles[told_at + tile * 256u + digit], OWN + earlier);
+            // FLAG_AGGREGATE | aggregate becomes FLAG_INCLUSIVE | (exclusive_prefix + aggregate).
+            atomicAdd(tile_status[status_base + tile * 256u + digit], FLAG_AGGREGATE + exclusive_prefix);
         }
-        offsets[digit] = digits[pass * 256u + digit] + earlier - start;
+        offsets[digit] = digit_bases[pass * 256u + digit] + exclusive_prefix - start;
     }
     barrier();
 
-    for (uint i = 0u; i < EACH; i++) {
-        uint index = first + (subgroup * EACH + i) * SUBGROUP_SIZE + lane;
+    for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
+        uint index = first + (subgroup * PAIRS_PER_THREAD + i) * SUBGROUP_SIZE + lane;
         uint digit = index < count ? ((own[i].x & mask) >> (8u * pass)) & 255u : 255u;
         staged[counters[subgroup * 256u + digit] + ranks[i]] = own[i];
     }
     barrier();
-    for (uint place = thread; place < TILE; place += THREADS) {
-        if (first + place < count) {
-            uvec2 pair = staged[place];
-            sorted[offsets[((pair.x & mask) >> (8u * pass)) & 255u] + place] = pair;
+    for (uint position = thread; position < TILE; position += THREADS) {
+        if (first + position < count) {
+            uvec2 pair = staged[position];
+            sorted[offsets[((pair.x & mask) >> (8u * pass)) & 255u] + position] = pair;
         }
     }
 }

@@ -1,13 +1,16 @@
 #version 460
-// SSIM, pass 1 of 3: vertical blur of x, y, x²+y² and xy. One thread makes a strip of STRIP outputs of one column in
-// registers, so each input is loaded once per strip (+10 halo rows) and no shared memory or barrier is needed.
-// Threads along x are neighbours in memory: coalesced on a GPU, one vector load on a CPU device.
+// SSIM, pass 1 of 3: vertical blur of x, y, x²+y² and xy. One thread makes a strip of STRIP outputs
+// of one column in registers, so each input is loaded once per strip (+10 halo rows) and no shared
+// memory or barrier is needed. Threads along x are neighbours in memory: coalesced on a GPU, one
+// vector load on a CPU device.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Rendered { float rendered[]; };  // [C, H, W]
-layout(std430, binding = 1) readonly buffer Target { float target_image[]; };  // [C, H, W], and [H, W] weights where there are some
+// [C, H, W], with [H, W] weights behind it where weighted is not 0.
+layout(std430, binding = 1) readonly buffer Target { float target_image[]; };
 layout(std430, binding = 2) writeonly buffer Means { vec2 means[]; };  // [C, H, W] blurred (x, y)
-layout(std430, binding = 3) writeonly buffer Moments { vec2 moments[]; };  // [C, H, W] blurred (x²+y², xy)
+// [C, H, W] blurred (x²+y², xy).
+layout(std430, binding = 3) writeonly buffer Moments { vec2 moments[]; };
 layout(push_constant) uniform Push { int width; int height; int weighted; };
 #include "shared/ssim.glsl"
 
@@ -24,7 +27,7 @@ void main() {
         int q = base + clamp(y, 0, height - 1) * width + x;
         float u = inside ? rendered[q] : 0.0;
         float v = inside ? target_image[q] : 0.0;
-        // What does not count looks as it should.
+        // A pixel of weight 0 takes the value of the target.
         if (weighted != 0) u = fma(target_image[3 * width * height + (q - base)], u - v, v);
         float squares = u * u + v * v, product = u * v;
         [[unroll]] for (int k = 0; k < STRIP; k++) {

@@ -1,16 +1,20 @@
 #version 460
 // SSIM, pass 3 of 3: vertical blur of the derivatives, then the gradient of
 //   l1_weight * mean|x-y| + dssim_weight * (1 - mean SSIM)
-// by x; the weights arrive divided by the number of values. Also the sum of |x-y| per strip. Where pixels have weights w, x is
-// y + w (x-y) in all three passes: what does not count has no part in the windows of its neighbours.
+// by x; the loss weights are given divided by the number of values. Also the sum of |x-y| per
+// strip. Where pixels have weights w, x is y + w (x-y) in all three passes: a pixel of weight 0
+// does not affect the windows of its neighbours.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Rendered { float rendered[]; };  // [C, H, W]
-layout(std430, binding = 1) readonly buffer Target { float target_image[]; };  // [C, H, W], and [H, W] weights where there are some
+// [C, H, W], with [H, W] weights behind it where weighted is not 0.
+layout(std430, binding = 1) readonly buffer Target { float target_image[]; };
 layout(std430, binding = 2) readonly buffer Slopes { vec2 slopes[]; };  // [C, H, W]
 layout(std430, binding = 3) readonly buffer Cross { float cross_slopes[]; };  // [C, H, W]
-layout(std430, binding = 4) writeonly buffer Gradient { float gradient[]; };  // [C, H, W]: the first planes of the upstream stack
-layout(std430, binding = 5) writeonly buffer Sums { float sums[]; };  // [C, strips, W] sum of |x-y| over each strip
+// [C, H, W]: the first planes of the upstream stack.
+layout(std430, binding = 4) writeonly buffer Gradient { float gradient[]; };
+// [C, strips, W] sum of |x-y| over each strip.
+layout(std430, binding = 5) writeonly buffer Sums { float sums[]; };
 // Rows outside first .. end belong to other bands of the image: no gradient, no loss.
 layout(push_constant) uniform Push { int width; int height; float l1_weight; float dssim_weight; int first; int end; int weighted; };
 #include "shared/ssim.glsl"

@@ -1,15 +1,18 @@
 #version 460
-// SSIM, pass 2 of 3, for CPU devices (for GPUs: ssim_rows_shared.comp): horizontal blur, SSIM and its derivatives by
-// (E[x], E[x²], E[xy]), and at once the horizontal blur of those derivatives, which stays in the same registers. A strip
-// needs halo 10: 5 for each blur.
+// SSIM, pass 2 of 3, for CPU devices (for GPUs: ssim_rows_shared.comp): horizontal blur, SSIM and
+// its derivatives by (E[x], E[x²], E[xy]), and the horizontal blur of these derivatives in the same
+// registers. A strip needs halo 10: 5 for each blur.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 8, local_size_y = 8) in;
 layout(std430, binding = 0) readonly buffer Means { vec2 means[]; };  // [C, H, W]
 layout(std430, binding = 1) readonly buffer Moments { vec2 moments[]; };  // [C, H, W]
-layout(std430, binding = 2) writeonly buffer Slopes { vec2 slopes[]; };  // [C, H, W] blurred (dS/dE[x], dS/dE[x²])
-layout(std430, binding = 3) writeonly buffer Cross { float cross_slopes[]; };  // [C, H, W] blurred dS/dE[xy]
-layout(std430, binding = 4) writeonly buffer Sums { float sums[]; };  // [C, H, strips] sum of S over each strip
-// Rows outside first .. end have their part in the derivatives of others, but are not summed.
+// [C, H, W] blurred (dS/dE[x], dS/dE[x²]).
+layout(std430, binding = 2) writeonly buffer Slopes { vec2 slopes[]; };
+// [C, H, W] blurred dS/dE[xy].
+layout(std430, binding = 3) writeonly buffer Cross { float cross_slopes[]; };
+// [C, H, strips] sum of S over each strip.
+layout(std430, binding = 4) writeonly buffer Sums { float sums[]; };
+// Rows outside first .. end contribute to the derivatives of other rows, but are not summed.
 layout(push_constant) uniform Push { int width; int height; int strips; int first; int end; };
 #include "shared/select.glsl"
 #include "shared/ssim.glsl"
@@ -20,7 +23,7 @@ void main() {
     int x0 = strip * STRIP;
     int base = int(gl_WorkGroupID.z) * width * height + y * width;
     if (y >= height || strip >= strips) return;
-    // The last 11 columns, and the derivatives of the last 11 windows.
+    // Sliding windows over the last 11 columns and over the derivatives of the last 11 windows.
     vec2 mean[TAPS], moment[TAPS];
     vec3 slope[TAPS];
     [[unroll]] for (int k = 0; k < TAPS; k++) {
@@ -44,13 +47,14 @@ void main() {
             m = fma(vec2(WINDOW[k]), mean[k], m);
             n = fma(vec2(WINDOW[k]), moment[k], n);
         }
-        // The window around this column is whole from i = 10 on; columns outside the image have no SSIM.
+        // The window around this column is complete from i = 10 on; columns outside the image have
+        // no SSIM.
         int centre = x0 + i - 15;
         vec4 d = ssim_of(m, n);
         bool real = both(centre >= 0, centre < width);
         slope[TAPS - 1] = select(real, d.xyz, vec3(0.0));
         sum += select(both(real, both(i >= 15, i < STRIP + 15)), d.w, 0.0);
-        // The derivatives of the windows around this column are there from i = 20 on.
+        // The derivatives of all windows around this column exist from i = 20 on.
         int out_x = x0 + i - 20;
         if (i >= 20 && out_x < width) {
             vec3 blurred = vec3(0.0);

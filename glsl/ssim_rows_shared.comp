@@ -1,20 +1,25 @@
 #version 450
-// SSIM, pass 2 of 3, as ssim_rows.comp but for GPUs: a workgroup makes SPAN neighbours of a row, which it reads and writes side
-// by side; what their windows share is in shared memory.
+// SSIM, pass 2 of 3, as ssim_rows.comp but for GPUs: a workgroup computes SPAN neighbouring outputs
+// of a row with coalesced reads and writes; their windows overlap in shared memory.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Means { vec2 means[]; };  // [C, H, W]
 layout(std430, binding = 1) readonly buffer Moments { vec2 moments[]; };  // [C, H, W]
-layout(std430, binding = 2) writeonly buffer Slopes { vec2 slopes[]; };  // [C, H, W] blurred (dS/dE[x], dS/dE[x²])
-layout(std430, binding = 3) writeonly buffer Cross { float cross_slopes[]; };  // [C, H, W] blurred dS/dE[xy]
-layout(std430, binding = 4) writeonly buffer Sums { float sums[]; };  // [C, H, strips] sum of S over each strip
-// Rows outside first .. end have their part in the derivatives of others, but are not summed.
+// [C, H, W] blurred (dS/dE[x], dS/dE[x²]).
+layout(std430, binding = 2) writeonly buffer Slopes { vec2 slopes[]; };
+// [C, H, W] blurred dS/dE[xy].
+layout(std430, binding = 3) writeonly buffer Cross { float cross_slopes[]; };
+// [C, H, strips] sum of S over each strip.
+layout(std430, binding = 4) writeonly buffer Sums { float sums[]; };
+// Rows outside first .. end contribute to the derivatives of other rows, but are not summed.
 layout(push_constant) uniform Push { int width; int height; int strips; int first; int end; };
 #include "shared/ssim.glsl"
 
 const int SPAN = 64; // outputs per workgroup
-shared vec4 blurred[SPAN + 4 * HALF]; // (means, moments) of the columns from 2 HALF before the first output on
-shared vec4 ssim[SPAN + 2 * HALF];    // of the columns from HALF before the first output on: derivatives and S
+// (means, moments) of the columns, from 2 HALF before the first output on.
+shared vec4 blurred[SPAN + 4 * HALF];
+// Derivatives and S of the columns, from HALF before the first output on.
+shared vec4 ssim[SPAN + 2 * HALF];
 
 void main() {
     int thread = int(gl_LocalInvocationID.x), y = int(gl_WorkGroupID.y), x0 = int(gl_WorkGroupID.x) * SPAN;

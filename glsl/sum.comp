@@ -1,5 +1,6 @@
 #version 460
-// Sums `count` floats into result[slot + workgroup], always in the same order: strided over all workgroups, then a tree.
+// Sums `count` floats into result[slot + workgroup], always in the same order: strided over all
+// workgroups, then a tree.
 layout(local_size_x = 256) in;
 layout(std430, binding = 0) readonly buffer Values { float values[]; };
 layout(std430, binding = 1) writeonly buffer Result { float result[]; };

@@ -1,4 +1,4 @@
-// The camera, always at binding 0.
+// Camera, always at binding 0.
 struct CameraView {
     vec4 world_to_camera[3]; // rows of (R | tau)
     vec2 focal;              // pixels

@@ -1,39 +1,47 @@
-// Slanted-plane matching, shared by plane_sweep.comp and plane_sweep_refine.comp. A hypothesis is the plane pi.X = 1 in
-// the reference camera's frame: 1/z = pi.ray, and the warp into a source view is the homography K_s (R + t pi^T).
-// Same order of operations as the CPU reference, src/pass/plane_sweep_cpu.rs.
+// Slanted-plane matching, shared by plane_sweep.comp and plane_sweep_refine.comp. A hypothesis is
+// the plane pi.X = 1 in the reference camera's frame: 1/z = pi.ray, and the warp into a source view
+// is the homography K_s (R + t pi^T). Same order of operations as the CPU reference,
+// src/pass/plane_sweep_cpu.rs.
 #extension GL_EXT_control_flow_attributes : require
 
 // Taps along one side of the matching window.
 const int TAPS = 5;
 // Pixels between two taps: 5 taps at every second pixel cover a 9 x 9 window at 31 % of its cost.
 const int TAP_STEP = 2;
-// Cost of a source view that sees nothing of the plane; also where costs saturate, so that one occluded view cannot
-// outvote the others. Unrelated patches have ZNCC about 0.
+// Cost of a source view that does not see the plane, and upper bound of any cost, so that one
+// occluded view cannot outweigh the others. Unrelated patches have ZNCC about 0.
 const float COST_LIMIT = 1.0;
-// Luma difference at which a tap's weight falls to 1/e: less and texture is lost, more and edges grow fat.
+// Luma difference at which a tap's weight falls to 1/e. A smaller one loses texture, a larger one
+// fattens edges.
 const float SIGMA_COLOUR = 0.03;
 // Pixel distance of the spatial Gaussian, as in ACMM.
 const float SIGMA_SPACE = 3.5;
-// Shares of the best, second, ... source view in the aggregated cost: the second view confirms, but a pixel seen by one
-// other view only still prefers the right plane.
+// Shares of the best, second, ... source view in the aggregated cost: the second view confirms, but
+// a pixel seen by only one other view still prefers the right plane.
 const vec4 VIEW_SHARES = vec4(0.6, 0.3, 0.1, 0.0);
 // Reprojection error (pixels) at which the geometric term saturates, as in ACMM.
 const float GEOMETRIC_LIMIT = 3.0;
-// Added to both variances: (1.5 grey levels)^2, the noise of an 8-bit JPEG. Flat patches get cost 1 instead of noise.
+// Added to both variances: (1.5 grey levels)^2, the noise of an 8-bit JPEG. Flat patches get cost 1
+// instead of noise.
 const float VARIANCE_FLOOR = 3.5e-5;
-// Relative difference of inverse depth at which the disagreement with a neighbour saturates: steps cost no more.
+// Relative difference of inverse depth at which the smoothness term saturates: a depth step costs
+// no more.
 const float SMOOTH_LIMIT = 0.03;
-// Neighbours whose depth a plane should continue into: the four at one pixel and the four at three, all of the other
-// checkerboard colour, so that they stand still during a step.
+// Neighbours of the smoothness term: the four at one pixel and the four at three, all of the other
+// checkerboard colour, so that they do not change during a step.
 const int SMOOTH_NEIGHBOURS = 8;
 
 // One source view as seen from a reference view.
 struct SourceView {
-    vec4 forward[3]; // rows of K_s [R | t]: (ray, 1/z) of the reference -> homogeneous source pixel, scaled by the inverse depth
-    vec4 back[3];    // rows of the inverse mapping: (ray, 1/z) of the source -> homogeneous reference pixel
+    // Rows of K_s [R | t]: (ray, 1/z) of the reference -> homogeneous source pixel, scaled by the
+    // inverse depth.
+    vec4 forward[3];
+    // Rows of the inverse mapping: (ray, 1/z) of the source -> homogeneous reference pixel.
+    vec4 back[3];
     vec4 centre;     // source camera centre in the reference frame; w unused
     vec4 intrinsics; // fx, fy, cx, cy of the source, pixels
-    uvec4 size;      // width, height, index of the view's first pixel in the shared image and plane buffers, unused
+    // Width, height, index of the view's first pixel in the shared image and plane buffers, unused.
+    uvec4 size;
 };
 
 layout(push_constant) uniform Push {
@@ -49,14 +57,16 @@ layout(push_constant) uniform Push {
     uint parity;
     uint planes;
     float smoothness;
-    // Position of the view's first pixel among those of all views, whichever of them the buffers hold.
+    // Index of the view's first pixel among the pixels of all views, also where the buffers hold a
+    // group of views only. Seeds the random numbers.
     uint identity;
 } push;
 
-// Per pixel the luma of the 2 x 2 pixels from it to the right and below, 16 bits each: one load per bilinear sample.
+// Luma of the 2 x 2 pixels from each pixel to the right and below, 16 bits each: one load per
+// bilinear sample.
 layout(std430, set = 0, binding = 0) readonly buffer Quads { uvec2 quads[]; };
 layout(std430, set = 0, binding = 1) readonly buffer Sources { SourceView source_views[]; };
-// pi and cost per pixel of all views.
+// (pi, cost) per pixel of all views.
 layout(std430, set = 0, binding = 2) buffer Planes { vec4 planes[]; };
 
 float weights[TAPS * TAPS];
@@ -183,7 +193,7 @@ float source_cost(uint index, ivec2 p, vec3 ray, vec3 plane) {
     return cost;
 }
 
-// Depth and weight of the neighbours that a plane should continue into.
+// Inverse depth and weight of the neighbours of the smoothness term.
 float neighbour_inverse[SMOOTH_NEIGHBOURS];
 float neighbour_weight[SMOOTH_NEIGHBOURS];
 
@@ -206,7 +216,7 @@ void load_neighbours(ivec2 p) {
     }
 }
 
-// How badly a plane continues into the neighbours' surfaces.
+// Smoothness term: weighted differences of inverse depth between a plane and the neighbours.
 float roughness(ivec2 p, vec3 plane) {
     float sum = 0.0;
     [[unroll]] for (int n = 0; n < SMOOTH_NEIGHBOURS; n++) {
@@ -217,7 +227,7 @@ float roughness(ivec2 p, vec3 plane) {
     return sum;
 }
 
-// Sorted source costs mixed by VIEW_SHARES.
+// Aggregated cost: the sorted source costs mixed by VIEW_SHARES.
 float plane_cost(ivec2 p, vec3 ray, vec3 plane) {
     vec4 best = vec4(COST_LIMIT + push.geometric * GEOMETRIC_LIMIT);
     for (uint s = 0u; s < push.sources; s++) {
@@ -231,7 +241,8 @@ float plane_cost(ivec2 p, vec3 ray, vec3 plane) {
     return dot(best, VIEW_SHARES);
 }
 
-// The plane through 1/z = inverse_depth with a normal; false if seen too obliquely or out of range.
+// Computes the plane through 1/z = inverse_depth with a normal; false if it is seen too obliquely
+// or out of range.
 bool make_plane(vec3 ray, vec3 normal, float inverse_depth, out vec3 plane) {
     float slope = dot(normal, ray);
     plane = normal * (inverse_depth / slope);

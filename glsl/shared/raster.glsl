@@ -1,8 +1,10 @@
-// One subgroup owns one 8x8 tile, its pixels live in registers. The lanes load SUBGROUP_SIZE splats together and
-// then loop over them with subgroupShuffle: no shared memory and no barrier. Equations: pass::raster_forward.
+// One subgroup blends one 8x8 tile, whose pixels live in registers. The lanes load SUBGROUP_SIZE
+// splats together and then loop over them with subgroupShuffle: no shared memory and no barrier.
+// Equations: pass::raster_forward.
 //
-// CHANNELS names a block of channels: 4 = RGB and depth, 7 / 12 / 20 = those and 3 / 8 / 16 features, 16 = sixteen
-// further features only. A block with room for more features than there are reads zeros for the rest.
+// CHANNELS is the size of a block of channels: 4 = RGB and depth, 7 / 12 / 20 = those and 3 / 8 /
+// 16 features, 16 = sixteen further features only. A block with room for more features than there
+// are reads zeros for the rest.
 #include "shared/layout.glsl"
 #include "shared/select.glsl"
 #define BASE (CHANNELS != 16)
@@ -13,8 +15,8 @@
 #endif
 #define FEATURE_VECTORS ((FEATURES + 3) / 4)
 
-// Which pixels of the tile a lane owns: column lane % LANES_X (+ LANES_X per column step), row lane / LANES_X
-// (+ LANES_Y per row step).
+// Pixels of a lane in the tile: column lane % LANES_X (+ LANES_X per column step), row
+// lane / LANES_X (+ LANES_Y per row step).
 #define LANES_X (SUBGROUP_SIZE < TILE ? SUBGROUP_SIZE : TILE)
 #define LANES_Y (SUBGROUP_SIZE / LANES_X)
 #define COLUMNS (TILE / LANES_X)

@@ -1,33 +1,42 @@
-// Gradients by the screen-space splats: T is recomputed front to back, six moments of σ and the channel sums are
-// reduced over the tile by butterflies so that lane i keeps splat i. Blocks of channels add up, since the gradient by
-// alpha is linear in the channels. Equations and reference: pass::raster_backward.
+// Gradients by the screen-space splats. T is recomputed front to back. Six moments of σ and the
+// channel sums are reduced over the tile by butterflies so that lane i keeps splat i. Blocks of
+// channels add up, because the gradient by alpha is linear in the channels. Equations and
+// reference: pass::raster_backward.
 //
-// BY_ENTRY 0: one atomic addition per value, tile and splat. 1: stored per entry for gradient_sum.comp, same bits every run.
+// BY_ENTRY 0: one atomic addition per value, tile and splat. 1: stored per entry for
+// gradient_sum.comp, the same bits on every run.
 #include "shared/layout.glsl"
 layout(local_size_x = SUBGROUP_SIZE) in;
 
-layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };      // [N, 3], see project.comp
-layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };   // [tiles + 1]
-layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };  // [capacity] (splat, entry)
+// [N, 3], see project.comp.
+layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };
+layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };  // [tiles + 1]
+// [capacity] (splat, entry).
+layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };
 #if CHANNELS != BASE_CHANNELS
-layout(std430, binding = 3) readonly buffer Codes { vec4 codes[]; };              // [N, code_vectors]
+layout(std430, binding = 3) readonly buffer Codes { vec4 codes[]; };  // [N, code_vectors]
 #if BY_ENTRY
-layout(std430, binding = 4) writeonly buffer CodeEntries { vec4 code_entries[]; }; // [entries, FEATURE_VECTORS] of this block
+// [entries, FEATURE_VECTORS] of this block.
+layout(std430, binding = 4) writeonly buffer CodeEntries { vec4 code_entries[]; };
 #else
-layout(std430, binding = 4) buffer CodesGrad { ATOMIC_FLOAT codes_grad[]; };      // [N, 4 * code_vectors], added to
+// [N, 4 * code_vectors], added to.
+layout(std430, binding = 4) buffer CodesGrad { ATOMIC_FLOAT codes_grad[]; };
 #endif
 #endif
-layout(std430, binding = 5) readonly buffer Planes { float planes[]; };           // [4 + d, H, W]
-layout(std430, binding = 6) readonly buffer PlanesGrad { float planes_grad[]; };  // [4 + d + 1, H, W], alpha last
+layout(std430, binding = 5) readonly buffer Planes { float planes[]; };  // [4 + d, H, W]
+// [4 + d + 1, H, W], alpha last.
+layout(std430, binding = 6) readonly buffer PlanesGrad { float planes_grad[]; };
 #if CHANNELS != 16
-layout(std430, binding = 7) readonly buffer Transmittance { float transmittances[]; }; // [H, W]
+layout(std430, binding = 7) readonly buffer Transmittance { float transmittances[]; };  // [H, W]
 #endif
 #if BY_ENTRY
-layout(std430, binding = 8) buffer SplatEntries { vec4 splat_entries[]; };            // [entries, 3] as projected_grad
+// [entries, 3] as projected_grad.
+layout(std430, binding = 8) buffer SplatEntries { vec4 splat_entries[]; };
 #else
-layout(std430, binding = 8) buffer ProjectedGrad { ATOMIC_FLOAT projected_grad[]; };  // [N, GRADIENT_FLOATS], added to
+// [N, GRADIENT_FLOATS], added to.
+layout(std430, binding = 8) buffer ProjectedGrad { ATOMIC_FLOAT projected_grad[]; };
 #endif
-// As in raster_forward.comp; coupling 0 keeps the features' part of the loss from moving the geometry, 1 lets it.
+// As in raster_forward.comp; coupling is 1 where the feature loss moves the geometry, else 0.
 layout(push_constant) uniform Push {
     uint width; uint top; uint rows; uint first_row; uint list_row;
     uint tiles_x; uint code_vectors; uint first_vector; uint first_plane; uint features;
@@ -54,7 +63,7 @@ void evaluate(uint i, vec2 origin) {
             const int k = n * ROWS + m;
             float dy = dy0 - float(m * LANES_Y);
             float raw = exp2(fma(fma(c, dy, bx), dy, ax));
-            // The comparison of raster_forward.comp, on the power: it must decide alike.
+            // The comparison of raster_forward.comp, so that both passes take the same splats.
             float alpha = select(fma(fma(c, dy, bx), dy, ax) >= LOG2_ALPHA_MIN, min(ALPHA_MAX, raw), 0.0);
             float w = alpha * T[k], next = T[k] - w;
             bool stop = next < TRANSMITTANCE_MIN;
@@ -97,7 +106,7 @@ void evaluate(uint i, vec2 origin) {
     }
 }
 
-// Where the sums of one (splat, entry) go.
+// Stores or adds the sums of one (splat, entry).
 void store_gradients(uvec2 item, float sums[VALUES]) {
 #if BY_ENTRY
 #if BASE
@@ -159,8 +168,8 @@ void main() {
         uvec2 item = tile_splats[min(j + lane, last - 1)];
         load_splat(item.x, j + lane < last);
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
-        // Both halves of the subgroup keep their own half sum of splat i; one exchange after the loop completes
-        // them. That saves a shuffle per value and splat.
+        // Both halves of the subgroup keep their own half sum of splat i, and one exchange after
+        // the loop completes them. That saves a shuffle per value and splat.
         float low[VALUES], high[VALUES];
         [[unroll]] for (int n = 0; n < VALUES; n++) low[n] = high[n] = 0.0;
         for (uint i = 0; i < batch; i++) {
@@ -198,7 +207,7 @@ void main() {
         if (all_stopped(T)) break;
     }
 #if BY_ENTRY
-    // Behind the last splat that any pixel sees.
+    // Entries behind the last splat that any pixel sees.
     float zeros[VALUES];
     [[unroll]] for (int n = 0; n < VALUES; n++) zeros[n] = 0.0;
     for (j += lane; j < last; j += SUBGROUP_SIZE) store_gradients(tile_splats[j], zeros);

@@ -1,6 +1,8 @@
-// `condition ? yes : no` and `a && b` without a branch: both operands are computed. GLSL's own operators become branches where an operand is
-// more than a name, and the time and memory of SwiftShader's compiler double with every branch of a loop. Its subgroups have 4
-// lanes. Lavapipe with 8 takes a tenth longer for the passes of the rasteriser without branches, so there they stay.
+// `condition ? yes : no` and `a && b` without a branch: both operands are computed. GLSL's own
+// operators become branches where an operand is more than a name, and the time and memory of
+// SwiftShader's compiler double with every branch of a loop. Its subgroups have 4 lanes. On
+// lavapipe, with 8, the passes of the rasteriser take a tenth longer without branches, so larger
+// subgroups keep them.
 #ifndef SELECT
 #define SELECT
 #if defined(SUBGROUP_SIZE) && SUBGROUP_SIZE > 4

@@ -1,4 +1,5 @@
-// Real spherical harmonics up to SH_DEGREE (order and signs of all 3DGS files). Reference: pass::sh.
+// Real spherical harmonics up to SH_DEGREE (order and signs of all 3DGS files). Reference:
+// pass::sh.
 #define SH_COUNT ((SH_DEGREE + 1) * (SH_DEGREE + 1))
 
 void sh_basis(vec3 d, out float b[SH_COUNT]) {
@@ -27,7 +28,7 @@ void sh_basis(vec3 d, out float b[SH_COUNT]) {
 #endif
 }
 
-// Derivatives of the basis by the direction, its components taken as free variables.
+// Derivatives of the basis by the direction, with its components as free variables.
 void sh_basis_gradient(vec3 d, out vec3 g[SH_COUNT]) {
     float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
     g[0] = vec3(0);

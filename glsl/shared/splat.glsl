@@ -1,7 +1,8 @@
-// Screen-space geometry of one splat, shared by projection and its backward pass. Equations: pass::project.
-// Needs shared/camera.glsl.
+// Screen-space geometry of one splat, shared by projection and its backward pass. Equations:
+// pass::project. Needs shared/camera.glsl.
 const float DILATION = 0.3; // a splat never gets thinner than about a pixel (INRIA's value)
-const float SMALLEST_AREA = 1e-12; // squared, px⁴: below it an opacity is invisible and its logarithm would not be finite
+// Least squared area, px⁴: below it a splat is invisible and the logarithm would not be finite.
+const float SMALLEST_AREA = 1e-12;
 
 struct Geometry {
     bool visible;       // beyond the near plane; the other fields are meaningless otherwise
@@ -11,7 +12,7 @@ struct Geometry {
     mat3 rotation;      // of the unit quaternion
     vec3 scale;
     vec2 clamped;       // t.xy, moved towards the image where it is far outside
-    bvec2 inside;       // not moved
+    bvec2 inside;       // true where t.xy was not moved
     vec3 j0, j1;        // Jacobian of the projection
     vec3 t0, t1;        // J R
     vec3 b0, b1;        // J R M

@@ -1,4 +1,5 @@
-// Window and constants of SSIM (11 taps, sigma 1.5, normalised); the test of src/pass/ssim_l1.rs computes the taps.
+// Window and constants of SSIM (11 taps, sigma 1.5, normalised). A test of src/pass/ssim_l1.rs
+// computes the taps.
 const int STRIP = 16; // outputs per thread
 const int HALF = 5;
 const int TAPS = 2 * HALF + 1;
@@ -7,7 +8,7 @@ const float WINDOW[TAPS] = float[](0.00102838008, 0.00759875814, 0.0360007721, 0
 const float C1 = 1e-4;  // 0.01², Wang et al. 2004
 const float C2 = 9e-4;  // 0.03²
 
-// Of a pixel with blurred (x, y) and (x² + y², xy): the derivatives of SSIM by (E[x], E[x²], E[xy]), and SSIM.
+// Derivatives of SSIM by (E[x], E[x²], E[xy]), and SSIM, from blurred (x, y) and (x² + y², xy).
 vec4 ssim_of(vec2 mean, vec2 moment) {
     float product = mean.x * mean.y, squares = mean.x * mean.x + mean.y * mean.y;
     float a1 = 2.0 * product + C1, a2 = 2.0 * (moment.y - product) + C2;

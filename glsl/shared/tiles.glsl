@@ -1,21 +1,23 @@
-// Which tiles a splat can change, row by row of tiles: those with a pixel centre inside the rectangle of the tile where
-// log2(o e^p) reaches log2(1/255). The band of a row cuts a convex piece out of the ellipse, so the tiles of a row are an
-// interval, whose ends follow from two chords. `precise`: counting and writing must take exactly the same decisions.
-// Needs `projected`.
+// Tiles that a splat can change, row by row of tiles: the tiles where log2(o e^p) reaches
+// log2(1/255) within the rectangle spanned by the pixel centres. The band of a row cuts a convex
+// piece out of the ellipse, so the tiles of a row are an interval, whose ends follow from two
+// chords. `precise`, because counting and writing must take exactly the same decisions. Needs
+// `projected`.
 #include "shared/layout.glsl"
 #include "shared/cutoffs.glsl"
-// The raster pass evaluates the same power in another order; 1e-3 covers the difference of up to 1e4 in size.
+// The raster pass evaluates the same power in another order; 1e-3 covers the rounding difference of
+// powers up to 1e4.
 const float MARGIN = 1e-3;
 
-struct Ellipse { // A' dx² + B' dx dy + C' dy² + k = 0, all coefficients but k negative or mixed
+struct Ellipse { // A' dx² + B' dx dy + C' dy² + k = 0, with A', C' < 0
     float u, v;          // centre
     float inv_a, det, k; // 1 / A', A'C' − B'²/4, A' k
     float slope;         // dx per dy of the middles of horizontal chords
-    float right_dy;      // where the ellipse reaches furthest right; left: the negative
+    float right_dy;      // dy of the rightmost point; that of the leftmost is its negative
     int first_row, last_row;
 };
 
-// Only rows of tiles from `begin` up to `end` count.
+// Ellipse of a splat, with its rows of tiles within `begin` .. `end`.
 Ellipse ellipse_of(uint splat, uint begin, uint end) {
     vec4 p = projected[PROJECTED_VECTORS * splat], q = projected[PROJECTED_VECTORS * splat + 1];
     precise float inv_a = 1.0 / p.z, det = q.z;
@@ -23,7 +25,7 @@ Ellipse ellipse_of(uint splat, uint begin, uint end) {
     precise float half_height = sqrt(max(-k / det, 0.0)), half_width = sqrt(max(-k * inv_a * q.x / det, 0.0));
     precise float slope = -0.5 * p.w * inv_a, right_dy = -0.5 * p.w / q.x * half_width;
     Ellipse e = Ellipse(p.x, p.y, inv_a, det, k, slope, right_dy, 0, 0);
-    // Clamping as floats first: a far splat must not overflow the conversion to int.
+    // Clamped as floats first: a far splat must not overflow the conversion to int.
     e.first_row = int(clamp(ceil((e.v - half_height - float(TILE - 1)) / float(TILE)), float(begin), float(end)));
     e.last_row = int(clamp(floor((e.v + half_height) / float(TILE)), float(begin) - 1.0, float(end) - 1.0));
     if (q.y < LOG2_ALPHA_MIN) e.last_row = -1;

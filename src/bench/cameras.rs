@@ -1,5 +1,5 @@
-//! Photos → cameras on data with a known answer, without training: how far off they are, and
-//! whether the stated uncertainty of the focal length is right.
+//! Benchmark of photos → cameras on data with true cameras, without training: errors of the
+//! cameras, and calibration of the stated uncertainty of the focal length.
 use crate::eval::{GroundTruth, Split, TruthFrame};
 use crate::infer::Registry;
 use crate::photo;
@@ -14,51 +14,51 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// One data set.
+/// Result of one data set.
 #[derive(Clone, Debug, Serialize)]
 pub struct CameraRow {
     /// Its folder.
     pub data: PathBuf,
     /// Photos used, by stem.
     pub photos: Vec<String>,
-    /// From files to cameras.
+    /// Wall time from files to cameras, seconds.
     pub seconds: f64,
-    /// What a run would warn of.
+    /// Warnings of a run.
     pub warnings: Vec<String>,
-    /// The figures, or why there are none.
+    /// Figures, or the reason of a failure.
     #[serde(flatten)]
     pub outcome: CameraOutcome,
 }
 
-/// Worst relative rotation above which cameras are wrong, degrees: hidden surfaces come out
-/// elsewhere.
+/// Largest error of a relative rotation of usable cameras, degrees: beyond it, occluded surfaces
+/// are reconstructed in the wrong place.
 const WRONG_ROTATION: f64 = 2.0;
-/// Error of the focal length above which they are, as a share: depth is stretched by as much.
+/// Largest relative error of the focal length of usable cameras: depth is stretched by as much.
 const WRONG_FOCAL: f64 = 0.1;
-/// Share of the mean depth within which cameras stand in one place.
+/// Largest distance of cameras in one place, over the mean depth.
 const ONE_PLACE: f64 = 1e-4;
-/// Worst error of a centre above which they are, over the mean depth.
+/// Largest error of a centre of usable cameras, over the mean depth.
 const WRONG_CENTRE: f64 = 0.05;
 
-/// Figures or the reason why there are none.
+/// Figures or a failure.
 #[derive(Clone, Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum CameraOutcome {
     /// Cameras were found.
     Figures(Box<CameraFigures>),
-    /// The error that a run would end with.
+    /// Error that a run would end with.
     Failure(String),
 }
 
-/// How far off the cameras of one data set are.
+/// Errors of the cameras of one data set.
 #[derive(Clone, Debug, Serialize)]
 pub struct CameraFigures {
     /// f / f_true − 1, mean over the photos.
     pub focal_error: f64,
     /// The largest |f / f_true − 1| of any photo.
     pub worst_focal_error: f64,
-    /// Whether the photos were all taken from one place: no depth can be right.
+    /// Whether all photos were taken from one place, so that no depth can be right.
     pub one_place: bool,
     /// Stated standard deviation of ln f.
     pub focal_sigma: Option<f64>,
@@ -78,18 +78,18 @@ pub struct CameraFigures {
     pub principal_point: f64,
     /// Worst stated standard deviation of a rotation against the first photo, degrees.
     pub rotation_sigma_degrees: f64,
-    /// That of the least sure camera.
+    /// Lowest confidence of a camera.
     pub confidence: Option<Confidence>,
-    /// Photos that got no camera, by stem; each was warned of.
+    /// Photos without a camera, by stem, each with a warning.
     pub left_out: Vec<String>,
-    /// The lens that was found, of the first photo.
+    /// Estimated lens of the first photo.
     pub lens: Lens,
-    /// The true lens, if the data state it.
+    /// True lens, if the data state it.
     pub true_lens: Option<Lens>,
 }
 
 impl CameraFigures {
-    /// Whether a scene on these cameras would mislead.
+    /// Whether an error exceeds its limit.
     fn wrong(&self) -> bool {
         self.one_place
             || self.pair_rotation_degrees > WRONG_ROTATION
@@ -98,22 +98,21 @@ impl CameraFigures {
     }
 }
 
-/// Data sets and their summary.
+/// Results of all data sets, with a summary.
 #[derive(Clone, Debug, Serialize)]
 #[non_exhaustive]
 pub struct CameraReport {
-    /// In the order given.
+    /// Results in the order given.
     pub rows: Vec<CameraRow>,
-    /// Data sets whose photos gave no cameras.
+    /// Number of data sets without cameras.
     pub failures: usize,
-    /// Data sets whose cameras are wrong: a relative rotation by more than 2 degrees, a focal
-    /// length by more than 10 %, a centre by more than 5 % of the mean depth, or any that show
-    /// depth where all photos were taken from one place.
+    /// Number of data sets with wrong cameras: a relative rotation by more than 2 degrees, a focal
+    /// length by more than 10 %, a centre by more than 5 % of the mean depth, or any cameras of
+    /// photos from one place.
     pub wrong: usize,
-    /// Those of them of whose cameras no warning was given; that another photo is left out says
-    /// nothing about them.
+    /// Data sets with wrong cameras without a warning; warnings of left-out photos do not count.
     pub wrong_without_warning: Vec<PathBuf>,
-    /// Share of the sets with a stated focal length whose error is within 2 σ.
+    /// Share of the sets with a stated σ of the focal length whose error is within 2 σ.
     pub within_2_sigma: Option<f64>,
     /// Median of |f / f_true − 1|.
     pub median_focal_error: Option<f64>,
@@ -123,38 +122,38 @@ pub struct CameraReport {
     pub median_centre_fraction: Option<f64>,
     /// Mean AUC up to 3, 5 and 30 degrees; a set without cameras counts 0.
     pub mean_auc: [Option<f64>; 3],
-    /// Sets by the confidence of their least sure camera, with their worst pair.
+    /// Sets by the lowest confidence of a camera, with their worst pair.
     pub by_confidence: Vec<ConfidenceRow>,
 }
 
-/// What a level of confidence was worth.
+/// Accuracy of the sets of one level of confidence.
 #[derive(Clone, Debug, Serialize)]
 pub struct ConfidenceRow {
-    /// The level.
+    /// Level of confidence.
     pub confidence: Confidence,
-    /// Sets whose least sure camera has it.
+    /// Number of sets with this lowest confidence.
     pub sets: usize,
-    /// Those of them with every relative rotation within one degree.
+    /// Number of these sets with all relative rotations within one degree.
     pub within_one_degree: usize,
-    /// The worst angle between relative rotations in any, degrees.
+    /// Worst angle between relative rotations of these sets, degrees.
     pub worst_rotation_degrees: f64,
 }
 
-/// Which pixels of the photos are used.
+/// Photos and pixels of the benchmark.
 #[derive(Clone, Copy, Debug)]
 pub struct PhotoInput {
     /// Longer side of the working image, pixels.
     pub max_size: usize,
-    /// Only the working image, as if the files were no larger.
+    /// Whether only the working image is used, as if the files were no larger.
     pub copies: bool,
-    /// Every two train frames by themselves instead of all together.
+    /// Whether every pair of train frames is a set of its own.
     pub pairs: bool,
 }
 
-/// Degrees up to which recall is added up.
+/// Limits of the area under the recall curve, degrees.
 const AUC_DEGREES: [f64; 3] = [3.0, 5.0, 30.0];
 
-/// Finds the cameras of every set's train frames, by themselves.
+/// Estimates the cameras of the train frames of every set.
 pub fn measure(
     sets: &[PathBuf],
     input: PhotoInput,
@@ -198,7 +197,7 @@ fn measure_set(
     Ok(CameraRow { data: truth.folder.clone(), photos, seconds, warnings: recorded.warnings(), outcome })
 }
 
-/// What a run does before its first dense stage.
+/// Estimates cameras as the stages of a run before the first dense one.
 fn find_cameras(
     folder: &Path,
     frames: &[&TruthFrame],
@@ -223,14 +222,14 @@ fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) 
         .enumerate()
         .filter_map(|(k, p)| Some((k, *frames.iter().find(|f| f.stem == p.stem)?)))
         .collect();
-    // Of the whole files, as those of the truth are.
+    // Cameras of the whole files, as in the truth.
     let estimated: Vec<_> =
         joined.iter().map(|(k, _)| placed.photos[*k].original_camera(&model.cameras[*k])).collect();
     let known: Vec<_> = joined.iter().map(|(_, f)| f.camera.clone()).collect();
     let depth = truth.mean_depth(frames)?;
     let errors = pose_errors(&estimated, &known, depth);
     let pairs = pair_errors(&estimated, &known);
-    let asked = frames.len() * frames.len().saturating_sub(1) / 2;
+    let all_pairs = frames.len() * frames.len().saturating_sub(1) / 2;
     let n = joined.len().max(1) as f64;
     let both = || estimated.iter().zip(&known);
     let logs: Vec<f64> =
@@ -241,8 +240,8 @@ fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) 
     };
     let apart = known.iter().map(from_first).fold(0.0, f64::max);
     let offset = both().map(|(e, t)| {
-        let at = |c: &crate::scene::Camera| (c.cx / f64::from(c.width), c.cy / f64::from(c.width));
-        let ((x, y), (tx, ty)) = (at(e), at(t));
+        let relative = |c: &crate::scene::Camera| (c.cx / f64::from(c.width), c.cy / f64::from(c.width));
+        let ((x, y), (tx, ty)) = (relative(e), relative(t));
         (x - tx).hypot(y - ty)
     });
     let worst = |values: &[f64]| values.iter().copied().fold(0.0, f64::max);
@@ -258,7 +257,7 @@ fn figures(truth: &GroundTruth, frames: &[&TruthFrame], placed: &SolvedCameras) 
         centre_fraction: worst(&errors.centre),
         pair_rotation_degrees: of_pairs(&|p| p.rotation_degrees),
         pair_direction_degrees: of_pairs(&|p| p.direction_degrees.unwrap_or(0.0)),
-        auc: AUC_DEGREES.map(|d| auc(&pairs, asked - pairs.len().min(asked), d)),
+        auc: AUC_DEGREES.map(|d| auc(&pairs, all_pairs - pairs.len().min(all_pairs), d)),
         principal_point: offset.fold(0.0, f64::max),
         rotation_sigma_degrees: worst(
             &model.fitted.iter().map(|f| f.rotation_sigma.to_degrees()).collect::<Vec<_>>(),
@@ -290,7 +289,7 @@ fn summarise(rows: Vec<CameraRow>) -> CameraReport {
         let sum: f64 = good.iter().filter_map(|f| f.auc[k]).sum();
         (!rows.is_empty()).then(|| sum / rows.len() as f64)
     });
-    let of_level = |confidence: Confidence| {
+    let row_of_level = |confidence: Confidence| {
         let own = good.iter().filter(|f| f.confidence == Some(confidence)).map(|f| f.pair_rotation_degrees);
         let errors: Vec<f64> = own.collect();
         ConfidenceRow {
@@ -305,7 +304,7 @@ fn summarise(rows: Vec<CameraRow>) -> CameraReport {
     let silent = silent.collect();
     let levels = [Confidence::High, Confidence::Medium, Confidence::Low];
     CameraReport {
-        by_confidence: levels.map(of_level).into_iter().filter(|r| r.sets > 0).collect(),
+        by_confidence: levels.map(row_of_level).into_iter().filter(|r| r.sets > 0).collect(),
         failures: rows.len() - good.len(),
         wrong: wrong().count(),
         wrong_without_warning: silent,
@@ -318,7 +317,7 @@ fn summarise(rows: Vec<CameraRow>) -> CameraReport {
     }
 }
 
-/// Heads of the columns of [`CameraRow::text`].
+/// Column heads of [`CameraRow::text`].
 pub fn header() -> String {
     format!(
         "{:<32}{:>9}{:>9}{:>6}{:>10}{:>9}{:>11}{:>9}{:>11}{:>7}{:>7}{:>7}{:>8}\n",
@@ -339,7 +338,7 @@ pub fn header() -> String {
 }
 
 impl CameraRow {
-    /// The row and its figures, if its cameras are wrong.
+    /// This row with its figures, if its cameras are wrong.
     fn wrong(&self) -> Option<(&CameraRow, &CameraFigures)> {
         match &self.outcome {
             CameraOutcome::Figures(f) if f.wrong() => Some((self, f)),
@@ -436,10 +435,10 @@ mod tests {
 
     #[test]
     #[ignore = "takes long: tools/test-long"]
-    fn breakfast_is_measured_and_photos_without_parallax_are_counted_as_failures() {
+    fn cameras_of_identical_photos_are_failures() {
         let registry = Registry::open(None).unwrap();
         let breakfast = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast");
-        // Two train frames whose photos are one and the same: no cameras.
+        // Two train frames with the same photo, which have no cameras.
         let dir = tempfile::tempdir().unwrap();
         let mut truth: serde_json::Value =
             serde_json::from_str(&std::fs::read_to_string(breakfast.join("ground_truth.json")).unwrap())
@@ -478,7 +477,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_cameras_without_a_warning_of_them_are_named() {
+    fn wrong_cameras_without_warning_are_listed() {
         let row = |data: &str, degrees: f64, warnings: &[&str]| CameraRow {
             data: data.into(),
             photos: Vec::new(),

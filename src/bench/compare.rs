@@ -1,8 +1,8 @@
-//! Two reports side by side.
+//! Comparison of two reports.
 use super::report::BenchReport;
 use std::fmt::Write;
 
-/// A table of the medians and figures that both reports have, with the ratio B / A.
+/// Table of the medians and figures of both reports, with the ratio B / A.
 pub fn table(a: &BenchReport, b: &BenchReport) -> String {
     // Writing to a String cannot fail.
     let mut text = format!("A: {} · {} · splatvk {}\n", a.device.name, a.device.driver, a.program);

@@ -1,4 +1,4 @@
-//! Seconds per step against intersections, over seeded scenes of growing size.
+//! Time per step against intersections, over seeded scenes of growing size.
 use super::measure::Budget;
 use super::model::Roofline;
 use super::report::{Clock, STEP, Section};
@@ -7,8 +7,8 @@ use super::workload::Workload;
 use crate::Result;
 use crate::gpu::Device;
 
-/// Training steps on seeded scenes of these sizes, which differ from `like` only in the number of
-/// splats.
+/// Measures training steps on seeded scenes of these sizes, which differ from `like` only in the
+/// number of splats.
 pub fn measure(
     device: &Device,
     sizes: &[usize],

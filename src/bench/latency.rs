@@ -1,4 +1,4 @@
-//! Text queries on a loaded scene.
+//! Latency of text queries on a loaded scene.
 use super::measure::Budget;
 use super::report::{Clock, Section};
 use crate::gpu::Device;
@@ -8,7 +8,7 @@ use crate::run::ask::QueryScene;
 use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
 
-/// One question to every camera of a scene, whose views are rendered and decoded once, before.
+/// Measures one query in all views of a scene, which are rendered and decoded once before.
 pub fn measure(
     device: &Device,
     (splats, field, cameras): (&Splats, LanguageField, &[Camera]),

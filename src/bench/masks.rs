@@ -1,5 +1,5 @@
-//! Photos → edges → masks on data with true masks, without cameras and without training: how well
-//! the best mask of any level fits each object, and whether one level has it in all photos.
+//! Benchmark of photos → edges → masks on data with true masks, without cameras and training: IoU
+//! of the best mask of any level with each object, and of the best single level over all photos.
 use crate::eval::{BACKGROUND_LABELS, GroundTruth, MIN_OBJECT_PIXELS};
 use crate::infer::Registry;
 use crate::infer::hed::Hed;
@@ -13,19 +13,19 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Instant;
 
-/// One data set.
+/// Result of one data set.
 #[derive(Clone, Debug, Serialize)]
 pub struct MaskRow {
     /// Its folder.
     pub data: PathBuf,
     /// Photos with true masks.
     pub photos: usize,
-    /// Objects as often as a photo shows them.
+    /// Number of (photo, object) pairs, where the photo shows the object.
     pub shown: usize,
-    /// IoU of an object with the best mask of any level, mean over these.
+    /// IoU of an object with the best mask of any level, mean over these pairs.
     pub best: f64,
-    /// The same with the one level per object that has it best over all photos, mean over the
-    /// objects.
+    /// IoU with the best mask of the level that is best for the object over all photos, mean over
+    /// the objects.
     pub one_level: f64,
     /// Masks per photo on levels s, m, l.
     pub masks: [f64; 3],
@@ -40,11 +40,11 @@ pub struct MaskRow {
 /// IoU of the masks with one object.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct ObjectFit {
-    /// Photos that show it.
+    /// Photos that show the object.
     pub photos: usize,
-    /// The best mask of each photo, mean.
+    /// IoU of the best mask of each photo, mean.
     pub best: f64,
-    /// The best mask of each photo on levels s, m, l, mean.
+    /// IoU of the best mask of each photo on levels s, m, l, mean.
     pub levels: [f64; 3],
 }
 
@@ -54,7 +54,7 @@ impl ObjectFit {
     }
 }
 
-/// Data sets and their means.
+/// Results of all data sets, with their means.
 #[derive(Clone, Debug, Serialize)]
 #[non_exhaustive]
 pub struct MaskReport {
@@ -66,7 +66,7 @@ pub struct MaskReport {
     pub one_level: f64,
 }
 
-/// Cuts every photo that has true masks, at a longer side of at most `max_size` pixels.
+/// Segments every photo that has true masks, at a longer side of at most `max_size` pixels.
 pub fn measure(
     sets: &[PathBuf],
     max_size: usize,
@@ -95,7 +95,7 @@ fn measure_set(
     let options = graph::GraphOptions::default();
     let (mut photos, mut edge_seconds, mut mask_seconds) = (0, 0.0, 0.0);
     let (mut masks, mut objects) = ([0.0; 3], BTreeMap::<String, ObjectFit>::new());
-    // true masks are those of a photo without distortion
+    // True masks exist for photos without distortion.
     for frame in truth.frames.iter().filter(|f| f.lens.is_none()) {
         progress.check()?;
         let Some(shown) = truth.objects(frame)? else { continue };
@@ -147,7 +147,7 @@ fn measure_set(
     })
 }
 
-/// Heads of the columns of [`MaskRow::text`].
+/// Column heads of [`MaskRow::text`].
 pub fn header() -> String {
     let [s, m, l] = LEVEL_NAMES.map(|n| format!("masks {n}"));
     format!(
@@ -190,7 +190,7 @@ mod tests {
     use std::path::Path;
 
     #[test]
-    fn breakfast_is_measured() {
+    fn masks_of_breakfast_reach_targets() {
         let registry = Registry::open(None).unwrap();
         let breakfast = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast");
         let mut seen = String::new();
@@ -206,8 +206,7 @@ mod tests {
             (12, 96, 8),
             "table, wall and carpet are no objects"
         );
-        // the targets of the built-in masks on this set; docs/internals/method.md#graph-masks
-        // states what they reach
+        // Targets of the built-in masks on this set (docs/internals/method.md#graph-masks).
         assert!(row.best > 0.9 && row.one_level > 0.88, "{seen}");
         assert!(row.one_level <= row.best && report.best == row.best);
         let mut sizes = row.masks.to_vec();

@@ -3,21 +3,21 @@ use crate::Result;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// How long one measurement runs.
+/// Length of one measurement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Budget {
-    /// Repeats for this long, but at least [`MIN_RUNS`] times.
+    /// Seconds of repeated runs, of which there are at least [`MIN_RUNS`].
     pub seconds: f64,
-    /// Exactly this often instead.
+    /// Exact number of runs instead.
     pub repeats: Option<usize>,
 }
 
-/// Fewer runs have no quartiles.
+/// Fewest runs with quartiles.
 pub const MIN_RUNS: usize = 5;
-/// Runs that are not counted: the driver compiles shaders at the first, caches and clocks settle at
-/// the second …
+/// Fewest warm-up runs: the driver compiles shaders in the first, caches and clocks settle in the
+/// second.
 const WARM_UP: usize = 2;
-/// … and, when a time is given, for this share of it.
+/// Least share of [`Budget::seconds`] for warm-up runs.
 const WARM_UP_SHARE: f64 = 0.1;
 
 impl Default for Budget {
@@ -27,7 +27,8 @@ impl Default for Budget {
 }
 
 impl Budget {
-    /// Calls `run` to warm up and then until the budget is used; what each counted call returned.
+    /// Calls `run` to warm up and then until the budget is used; returns the results after the
+    /// warm-up.
     pub fn repeat<T>(&self, mut run: impl FnMut() -> Result<T>) -> Result<Vec<T>> {
         let start = Instant::now();
         let mut warm = 0;
@@ -51,7 +52,7 @@ impl Budget {
         }
     }
 
-    /// Wall-clock milliseconds of each call.
+    /// Wall-clock milliseconds per call.
     pub fn wall(&self, mut run: impl FnMut() -> Result<()>) -> Result<Quartiles> {
         let runs = self.repeat(|| {
             let (processor, start) = (processor_ms(), Instant::now());
@@ -75,7 +76,7 @@ pub(super) fn processor_ms() -> f64 {
     threads.filter_map(nanoseconds).sum::<f64>() / 1e6
 }
 
-/// Of the host, as far as this process may use them.
+/// Number of host cores that this process may use.
 pub(super) fn cores() -> f64 {
     std::thread::available_parallelism().map_or(1, usize::from) as f64
 }
@@ -83,29 +84,29 @@ pub(super) fn cores() -> f64 {
 /// The distribution of repeated times, milliseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Quartiles {
-    /// Half of the runs took at most this.
+    /// Median.
     pub median: f64,
-    /// A quarter took at most this …
+    /// First quartile.
     pub lower_quartile: f64,
-    /// … and a quarter at least this.
+    /// Third quartile.
     pub upper_quartile: f64,
     /// The fastest run.
     pub best: f64,
-    /// How many runs.
+    /// Number of runs.
     pub runs: usize,
-    /// Median of the processor time of this process, all threads, divided by the cores: on a CPU
-    /// device about what a run would take if nothing else ran. 0 where it was not taken.
+    /// Median of the processor time of all threads of this process, divided by the cores: on a CPU
+    /// device about the time of a run on an idle machine. 0 where it was not measured.
     #[serde(default)]
     pub processor: f64,
 }
 
 impl Quartiles {
-    /// Of the given times; all zero when there are none.
+    /// Quartiles of the given times; all zero without any.
     pub fn of(times: &[f64]) -> Quartiles {
         let mut sorted = times.to_vec();
         sorted.sort_by(f64::total_cmp);
         // Linear interpolation between the order statistics.
-        let at = |share: f64| {
+        let quantile = |share: f64| {
             let x = share * sorted.len().saturating_sub(1) as f64;
             let (low, high) = (x.floor() as usize, x.ceil() as usize);
             match (sorted.get(low), sorted.get(high)) {
@@ -114,10 +115,10 @@ impl Quartiles {
             }
         };
         Quartiles {
-            median: at(0.5),
-            lower_quartile: at(0.25),
-            upper_quartile: at(0.75),
-            best: at(0.0),
+            median: quantile(0.5),
+            lower_quartile: quantile(0.25),
+            upper_quartile: quantile(0.75),
+            best: quantile(0.0),
             runs: times.len(),
             processor: 0.0,
         }
@@ -129,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn quartiles_of_known_times() {
+    fn quartiles_of_known_times_match() {
         let s = Quartiles::of(&[5.0, 1.0, 2.0, 4.0, 3.0]);
         assert_eq!((s.best, s.lower_quartile, s.median, s.upper_quartile, s.runs), (1.0, 2.0, 3.0, 4.0, 5));
         let s = Quartiles::of(&[1.0, 2.0]);
@@ -138,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn warm_up_is_not_counted_and_repeats_are_exact() {
+    fn budget_repeats_exactly_after_warm_up() {
         let mut calls = 0;
         let budget = Budget { seconds: 0.0, repeats: Some(3) };
         let seen = budget

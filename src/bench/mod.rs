@@ -1,9 +1,9 @@
-//! `splatvk bench`: reproducible workloads, per-pass and whole-step times with their spread, and
-//! the device's own limits measured in the same run.
+//! `splatvk bench`: reproducible workloads, times of passes and whole steps with their quartiles,
+//! and the limits of the device, measured in the same run.
 //!
-//! The steps are those of [`crate::fit`], recorded by the code that trains; learning rates are
-//! zero, so that every repetition does the same work on the same scene. The photo to fit is the
-//! scene's own render, a little paler.
+//! The steps are those of [`crate::fit`], recorded by the same code; learning rates are zero, so
+//! that every repetition does the same work on the same scene. The photo to fit is a render of the
+//! scene, a little paler.
 pub mod cameras;
 pub mod compare;
 mod growth;
@@ -32,12 +32,12 @@ pub struct Bench<'a> {
     device: &'a Device,
     budget: Budget,
     roofline: Roofline,
-    /// What was found so far.
+    /// Results so far.
     pub report: BenchReport,
 }
 
 impl<'a> Bench<'a> {
-    /// Measures the device's limits.
+    /// Measures the limits of the device.
     pub fn new(device: &'a Device, budget: Budget) -> Result<Bench<'a>> {
         let (roofline, section) = roofline::measure(device, &budget)?;
         let mut report = BenchReport::new(device);
@@ -45,7 +45,7 @@ impl<'a> Bench<'a> {
         Ok(Bench { device, budget, roofline, report })
     }
 
-    /// The training step on colour, and then with `features` more channels (0 = leave that out).
+    /// Measures the training step on colour, then with `features` more channels (0 = only colour).
     pub fn training(&mut self, workload: &Workload, features: usize) -> Result<()> {
         check_features(features)?;
         let limits = (&self.budget, &self.roofline);
@@ -58,21 +58,21 @@ impl<'a> Bench<'a> {
         Ok(())
     }
 
-    /// The training step on seeded scenes of growing size that are otherwise like `like`.
+    /// Measures the training step on seeded scenes of growing size that are otherwise like `like`.
     pub fn growth(&mut self, sizes: &[usize], like: &Workload) -> Result<()> {
         let limits = (&self.budget, &self.roofline);
         self.report.sections.push(growth::measure(self.device, sizes, like, limits)?);
         Ok(())
     }
 
-    /// The radix sort of random keys with values.
+    /// Measures the radix sort of random keys with values.
     pub fn sort(&mut self, keys: usize) -> Result<()> {
         let limits = (&self.budget, &self.roofline);
         self.report.sections.push(sorting::measure(self.device, keys, limits)?);
         Ok(())
     }
 
-    /// A text query in all views of a scene.
+    /// Measures a text query in all views of a scene.
     pub fn query(
         &mut self,
         scene: (&Splats, LanguageField, &[Camera]),
@@ -85,7 +85,7 @@ impl<'a> Bench<'a> {
     }
 }
 
-/// The channels that steps with features exist for.
+/// Checks that training steps exist for a number of feature channels.
 pub fn check_features(features: usize) -> Result<()> {
     if features <= 16 || (features.is_multiple_of(16) && features <= 48) {
         return Ok(());

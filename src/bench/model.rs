@@ -1,13 +1,13 @@
-//! How much work each pass has to do: bytes that must move at least once and arithmetic on pairs
-//! that are blended. What an implementation does beyond that (pairs evaluated in vain, lists read
-//! twice) is what the roofline shows up.
+//! Least work of each pass: bytes that must move at least once, and arithmetic on blended pairs.
+//! The roofline shows the overhead of an implementation, such as pairs evaluated without effect or
+//! lists read twice.
 //!
 //! Floats per splat: 11 of geometry and opacity, 3 per SH coefficient, d features; of a projected
 //! splat PROJECTED_FLOATS. Operations are counted from the formulas of the passes, a fused
 //! multiply-add as two, an exponential as one.
 use crate::gpu::shaders;
 
-/// What the device can do at most.
+/// Limits of the device.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Roofline {
     /// Bytes read plus bytes written by a copy, per second.
@@ -23,7 +23,7 @@ impl Roofline {
     }
 }
 
-/// Sizes of a step.
+/// Sizes that determine the work of a step.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct PassWork {
     /// N.
@@ -50,7 +50,7 @@ const PAIR: f64 = 8.0;
 const SORT_PASSES: f64 = 4.0;
 /// Power of the Gaussian (8), its exponential, clamp, weight and the transmittance after it.
 const WEIGH: f64 = 14.0;
-/// Gradient of alpha from what lies behind (6), of the power and its six moments (24).
+/// Gradient of alpha from the sum behind it (6), of the power and its six moments (24).
 const WEIGH_BACK: f64 = 30.0;
 
 impl PassWork {
@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn work_grows_with_what_it_depends_on() {
+    fn pass_work_grows_with_features() {
         let small =
             PassWork { splats: 1e5, sh: 1.0, pixels: 3e5, intersections: 5e5, blended: 1e7, features: 0.0 };
         let more = PassWork { features: 16.0, ..small };

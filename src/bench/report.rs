@@ -1,4 +1,4 @@
-//! Figures of a benchmark, as a table and as JSON.
+//! Benchmark report, as a table and as JSON.
 use super::measure::{Budget, Quartiles, cores, processor_ms};
 use super::model::{PassWork, Roofline};
 use crate::gpu::{Device, Program, Recorder};
@@ -10,13 +10,13 @@ use std::path::Path;
 /// Name and version of the JSON layout; readers refuse others.
 const FORMAT: &str = "splatvk-bench 1";
 
-/// Name of the section of steps on colour; others begin with it.
+/// Name of the section of steps on colour; names of other sections of steps begin with it.
 pub const COLOUR: &str = "training step";
 /// Row of the whole step.
 pub const STEP: &str = "training step";
-/// Row that adds up the passes above it.
+/// Row of the sum of the passes.
 pub const SUM: &str = "sum of the passes";
-/// Passes that a render consists of.
+/// Passes of a render.
 const FORWARD: [&str; 4] = ["projection", "depth sort", "binning", "raster forward"];
 
 /// Everything one run of `splatvk bench` measured.
@@ -27,9 +27,9 @@ pub struct BenchReport {
     pub format: String,
     /// Version of this program.
     pub program: String,
-    /// Where it ran.
+    /// Device of the run.
     pub device: DeviceRecord,
-    /// In the order they were measured.
+    /// Sections in the order of measurement.
     pub sections: Vec<Section>,
 }
 
@@ -37,32 +37,32 @@ pub struct BenchReport {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct DeviceRecord {
-    /// As the driver reports it.
+    /// Name from the driver.
     pub name: String,
     /// Driver and version.
     pub driver: String,
     /// Vulkan version.
     pub vulkan: String,
-    /// A software device.
+    /// Whether it is a software device.
     pub is_cpu: bool,
-    /// Threads.
+    /// Threads of a subgroup.
     pub subgroup_size: u32,
-    /// Of the host.
+    /// Cores of the host.
     pub cores: usize,
 }
 
 /// Measurements that belong together.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Section {
-    /// What was measured; equal names are compared between reports.
+    /// Name; sections of equal names are compared between reports.
     pub name: String,
-    /// On what.
+    /// Workload.
     pub workload: String,
     /// Times.
     pub rows: Vec<PassRow>,
     /// Counts and derived figures.
     pub figures: Vec<Figure>,
-    /// What the passes are made of, for those who make them faster; not in the plain table.
+    /// Commands of the passes, for optimisation; not in the plain table.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub commands: Vec<CommandRow>,
 }
@@ -70,29 +70,29 @@ pub struct Section {
 /// The commands of one name in a pass: a shader, a copy or a fill.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct CommandRow {
-    /// The pass that they belong to.
+    /// Pass of the commands.
     pub pass: String,
-    /// Shader, or what is filled or copied.
+    /// Name of the shader, or of the filled or copied buffer.
     pub name: String,
-    /// How many.
+    /// Number of commands.
     pub count: usize,
-    /// Milliseconds of all of them, by timestamps on the device.
+    /// Milliseconds of all commands, by timestamps on the device.
     pub ms: Quartiles,
 }
 
-/// One timed thing.
+/// Time of a pass or of a part of a step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct PassRow {
-    /// Pass or part of a step.
+    /// Name of the pass or part.
     pub name: String,
-    /// How it was timed.
+    /// Clock of the times.
     pub clock: Clock,
     /// Milliseconds.
     pub ms: Quartiles,
-    /// Bytes that have to move, estimated.
+    /// Least bytes to move, estimated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub bytes: Option<f64>,
-    /// Floating-point operations that have to be done, estimated.
+    /// Least floating-point operations, estimated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub flops: Option<f64>,
     /// Least milliseconds by the measured roofline.
@@ -100,7 +100,7 @@ pub struct PassRow {
     pub floor_ms: Option<f64>,
 }
 
-/// What a time is.
+/// Clock of a time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
@@ -108,12 +108,12 @@ pub enum Clock {
     /// Difference of two timestamps on the device.
     #[default]
     Device,
-    /// Of the host, submission and waiting included.
+    /// Wall clock of the host, with submission and waiting.
     Wall,
 }
 
 impl PassRow {
-    /// Bytes, operations and the least milliseconds for them.
+    /// Sets bytes, operations and the least milliseconds for them.
     fn set_floor(&mut self, [bytes, flops, ms]: [f64; 3]) {
         (self.bytes, self.flops, self.floor_ms) = (Some(bytes), Some(flops), Some(ms));
     }
@@ -122,11 +122,11 @@ impl PassRow {
 /// One number.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Figure {
-    /// What it counts.
+    /// Name.
     pub name: String,
-    /// Its value.
+    /// Value.
     pub value: f64,
-    /// Empty for a ratio.
+    /// Unit; empty for a ratio.
     pub unit: String,
 }
 
@@ -152,20 +152,23 @@ impl BenchReport {
 
     /// Reads a report from its JSON file.
     pub fn read(path: &Path) -> Result<BenchReport> {
-        let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
         let report: BenchReport = files::read_json(path, "give a file of splatvk bench --json")?;
         if report.format != FORMAT {
-            return Err(bad(format!("layout {:?}; this program reads {FORMAT:?}", report.format)));
+            let path = path.display();
+            return Err(Error::input(format!(
+                "{path}: layout {:?}; this program reads {FORMAT:?}",
+                report.format
+            )));
         }
         Ok(report)
     }
 
-    /// The section of a name.
+    /// Section by name.
     pub fn section(&self, name: &str) -> Option<&Section> {
         self.sections.iter().find(|s| s.name == name)
     }
 
-    /// Adds the figures that need two sections: steps with features by the step without.
+    /// Adds the ratios of steps with features to the step without.
     pub fn relate(&mut self) {
         let step = |s: &Section| s.row(STEP).map(|r| r.ms.median);
         let Some(base) = self.section(COLOUR).and_then(step) else { return };
@@ -191,8 +194,8 @@ impl BenchReport {
     }
 }
 
-/// The times of timed commands added up by the key of each, in the order of first commands: key,
-/// and milliseconds per run.
+/// Sums of timed commands by key, in the order of the first command of a key: (key, milliseconds
+/// per run).
 fn sums_by<K: Copy + PartialEq>(keys: &[K], runs: &[Vec<(String, f64)>]) -> Vec<(K, Vec<f64>)> {
     let mut sums: Vec<(K, Vec<f64>)> = Vec::new();
     for (at, &key) in keys.iter().enumerate() {
@@ -211,12 +214,12 @@ impl Section {
         Section { name: name.into(), workload: workload.into(), ..Section::default() }
     }
 
-    /// The row of a name.
+    /// Row by name.
     pub fn row(&self, name: &str) -> Option<&PassRow> {
         self.rows.iter().find(|r| r.name == name)
     }
 
-    /// The value of a figure.
+    /// Value of a figure by name.
     pub fn value(&self, name: &str) -> Option<f64> {
         self.figures.iter().find(|f| f.name == name).map(|f| f.value)
     }
@@ -226,15 +229,15 @@ impl Section {
         self.rows.push(PassRow { name: name.into(), clock, ms, ..PassRow::default() });
     }
 
-    /// Adds a figure, if it is a number: a ratio by nothing is left out.
+    /// Adds a figure, if it is finite.
     pub fn figure(&mut self, name: impl Into<String>, value: f64, unit: &str) {
         if value.is_finite() {
             self.figures.push(Figure { name: name.into(), value, unit: unit.to_owned() });
         }
     }
 
-    /// Runs what `record` records again and again and adds a row per pass; the milliseconds of each
-    /// run, all passes.
+    /// Runs the program of `record` repeatedly and adds a row per pass; returns the milliseconds of
+    /// all passes per run.
     pub(super) fn passes(
         &mut self,
         device: &Device,
@@ -256,8 +259,7 @@ impl Section {
         for (name, times) in &sums {
             self.time(*name, Clock::Device, Quartiles::of(times));
         }
-        // Where the host is the device, the processor time of a pass tells what it takes when
-        // nothing else runs.
+        // On a CPU device, the processor time of a pass is about its time on an idle machine.
         if device.info().is_cpu {
             let programs = record().compile_passes()?;
             let runs = budget.repeat(|| {
@@ -278,7 +280,7 @@ impl Section {
         Ok((0..timed.len()).map(|run| sums.iter().map(|(_, times)| times[run]).sum()).collect())
     }
 
-    /// Fills in bytes, operations and floors of the passes, and of the rows that are made of them.
+    /// Sets bytes, operations and floors of the passes, and of the rows that consist of passes.
     pub(super) fn bound(&mut self, work: &PassWork, roofline: &Roofline) {
         let mut sums = [[0.0; 3]; 3];
         for row in self.rows.iter_mut().filter(|r| r.clock == Clock::Device) {
@@ -338,7 +340,7 @@ impl Section {
     }
 }
 
-/// Whole numbers as they are, others with the digits that mean something.
+/// Formats a whole number without decimals, others with the significant ones.
 fn plain(value: f64) -> String {
     if value.fract() == 0.0 && value.abs() < 1e15 {
         format!("{value:.0}")

@@ -1,4 +1,4 @@
-//! The device's own limits, by small shaders, in the same run as what is compared with them.
+//! Limits of the device, measured with small shaders in the same run as the passes.
 use super::measure::Budget;
 use super::model::Roofline;
 use super::report::Section;
@@ -11,8 +11,7 @@ const COPY_STEPS: usize = shaders::bench_copy::STEPS as usize;
 /// Fused multiply-adds per thread in `glsl/bench_fma.comp`.
 const FMA_PER_THREAD: usize = (shaders::bench_fma::CHAINS * shaders::bench_fma::STEPS) as usize;
 
-/// Measures both limits. The best run counts: a limit is what the device can do, not what it
-/// usually does.
+/// Measures both limits. The best run counts, since a limit is the most that the device can do.
 pub fn measure(device: &Device, budget: &Budget) -> Result<(Roofline, Section)> {
     let mut section = Section::new("roofline", "copies and fused multiply-adds");
     let bytes_per_second = copy(device, budget, &mut section)?;
@@ -22,7 +21,7 @@ pub fn measure(device: &Device, budget: &Budget) -> Result<(Roofline, Section)> 
     Ok((Roofline { bytes_per_second, flops_per_second }, section))
 }
 
-/// By a shader and by the driver's copy command: the faster one is the limit.
+/// Bytes per second of the faster of a copy shader and the copy command of the driver.
 fn copy(device: &Device, budget: &Budget, section: &mut Section) -> Result<f64> {
     // Several times the last-level cache: 128 MiB in all on a CPU, 512 on a GPU.
     let mib = if device.info().is_cpu { 64 } else { 256 };
@@ -42,7 +41,7 @@ fn copy(device: &Device, budget: &Budget, section: &mut Section) -> Result<f64> 
     Ok(32.0 * vectors as f64 / (fastest(device, &record, budget, section)? / 1e3))
 }
 
-/// Measures the passes and returns the best milliseconds of any.
+/// Measures the passes and returns the milliseconds of the fastest.
 fn fastest(
     device: &Device,
     record: &dyn Fn() -> Recorder,
@@ -54,11 +53,12 @@ fn fastest(
     Ok(section.rows[before..].iter().map(|r| r.ms.best).fold(f64::INFINITY, f64::min))
 }
 
-/// About 14 ms on lavapipe and 1 ms on a large GPU: long against launching it.
+/// Number of threads for about 14 ms on lavapipe and 1 ms on a large GPU, long against the launch.
 fn fma_threads(device: &Device) -> usize {
     if device.info().is_cpu { 1 << 17 } else { 1 << 22 }
 }
 
+/// Floating-point operations per second of fused multiply-adds.
 fn arithmetic(device: &Device, budget: &Budget, section: &mut Section) -> Result<f64> {
     let threads = fma_threads(device);
     let values = device.buffer::<f32>("fma values", threads)?;
@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn limits_are_positive_and_bound_the_time() {
+    fn measured_limits_are_positive() {
         let device = crate::gpu::test_device();
         let budget = Budget { seconds: 0.0, repeats: Some(2) };
         let (roofline, section) = measure(&device, &budget).unwrap();
@@ -94,7 +94,7 @@ mod tests {
     }
 
     #[test]
-    fn the_shaders_do_what_is_counted() {
+    fn limit_shaders_do_the_counted_work() {
         let device = crate::gpu::test_device();
         let n = 3 * 256 * COPY_STEPS;
         let from = device.buffer_from("from", &(0..4 * n).map(|i| i as f32).collect::<Vec<_>>()).unwrap();

@@ -1,4 +1,4 @@
-//! The radix sort by itself.
+//! Benchmark of the radix sort.
 use super::measure::Budget;
 use super::model::Roofline;
 use super::report::Section;
@@ -11,11 +11,11 @@ use crate::{Error, Result};
 const BITS: u32 = 32;
 /// Digits of eight bits: the passes over the data.
 const PASSES: f64 = 4.0;
-/// A key and a value are read and written in each pass. Counting the digits reads keys again; that
-/// is overhead here.
+/// A key and a value, read and written. Counting the digits reads keys again, which is overhead
+/// here.
 const BYTES_PER_PASS: f64 = 16.0;
 
-/// Sorts `keys` random 32-bit keys with values.
+/// Measures the sort of `keys` random 32-bit keys with values.
 pub fn measure(device: &Device, keys: usize, limits: (&Budget, &Roofline)) -> Result<Section> {
     let (budget, roofline) = limits;
     let mut random = Random::new(1);

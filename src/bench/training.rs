@@ -1,4 +1,5 @@
-//! The training step: each pass by timestamps on the device, the whole by wall clock.
+//! Benchmark of the training step: passes by timestamps on the device, the whole step by wall
+//! clock.
 use super::measure::{Budget, Quartiles};
 use super::model::{PassWork, Roofline};
 use super::report::{COLOUR, Clock, STEP, SUM, Section};
@@ -15,10 +16,10 @@ use crate::scene::{Codebook, Image, LevelField, RgbImage};
 
 /// Codes per level of the synthetic feature targets; a scene of four photos has about as many.
 const CODES: usize = 32;
-/// Far behind the schedule's end.
+/// A step far beyond the end of the schedules.
 const ITERATION: usize = 1_000_000;
 
-/// Forward, L1 + SSIM, regularisers, backward, Adam: the step of the colour stage.
+/// Measures the step of the colour stage: forward, L1 + SSIM, regularisers, backward, Adam.
 pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)) -> Result<Section> {
     device.reset_peak_memory();
     let target = [workload.target(device)?];
@@ -36,8 +37,8 @@ pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)
     Ok(section)
 }
 
-/// The step of the language stage with `features` channels: the same image loss, and L1 to the
-/// codes of labelled pixels.
+/// Measures the step of the language stage with `features` channels: the same image loss, and L1 to
+/// the codes of labelled pixels.
 pub fn with_features(
     device: &Device,
     workload: &Workload,
@@ -72,7 +73,7 @@ pub fn with_features(
     Ok(section)
 }
 
-/// Codes and a label per pixel, in blocks as masks have them.
+/// Random codes, with labels in blocks of pixels.
 fn level(image: &RgbImage, width: usize, seed: u64) -> LevelField {
     let mut codes = seeded::features(CODES, width, seed);
     for code in codes.chunks_exact_mut(width) {
@@ -101,7 +102,7 @@ fn measure(
     section: &mut Section,
 ) -> Result<()> {
     let (budget, roofline) = limits;
-    // Also grows the tile lists to what the scene needs, before anything is recorded.
+    // Grows the tile lists to the size of the scene before the first recording.
     run.step(ITERATION)?;
     let sums = section.passes(device, &|| run.record(0), budget)?;
     let processor = section.rows.iter().map(|r| r.ms.processor).sum();
@@ -113,16 +114,21 @@ fn measure(
         run.step(ITERATION)
     })?;
     let allocations = (device.memory().allocations - before) as f64 / steps as f64;
-    parts(device, run, budget, section)?;
+    measure_forward_backward(device, run, budget, section)?;
     section.time(STEP, Clock::Wall, step);
-    counts(device, run, roofline, section)?;
+    add_figures(device, run, roofline, section)?;
     section.figure("allocations per step", allocations, "");
     Ok(())
 }
 
-/// Forward, and forward with backward, as programs of their own.
-fn parts(device: &Device, run: &impl Training, budget: &Budget, section: &mut Section) -> Result<()> {
-    let p = run.trainer().parts();
+/// Measures forward, and forward with backward, as separate programs.
+fn measure_forward_backward(
+    device: &Device,
+    run: &impl Training,
+    budget: &Budget,
+    section: &mut Section,
+) -> Result<()> {
+    let p = run.trainer().step_resources();
     for (name, backward) in [("forward", false), ("forward + backward", true)] {
         let mut rec = Recorder::new(device, name);
         p.raster.record_forward(&mut rec, p.params, p.options);
@@ -135,9 +141,14 @@ fn parts(device: &Device, run: &impl Training, budget: &Budget, section: &mut Se
     Ok(())
 }
 
-/// How much work a step is, and the least time for it.
-fn counts(device: &Device, run: &impl Training, roofline: &Roofline, section: &mut Section) -> Result<()> {
-    let p = run.trainer().parts();
+/// Adds counts of the work of a step, and its least time.
+fn add_figures(
+    device: &Device,
+    run: &impl Training,
+    roofline: &Roofline,
+    section: &mut Section,
+) -> Result<()> {
+    let p = run.trainer().step_resources();
     let frame = p.raster.frame();
     let intersections = f64::from(frame.status.read()?[0]);
     let [evaluated, blended] = pairs::count(device, p.raster)?;

@@ -1,4 +1,4 @@
-//! What is measured: splats and a camera.
+//! Workloads: splats and a camera.
 use crate::format::{cameras, create_folder, picture, ply, scene_dir, write_json};
 use crate::gpu::Device;
 use crate::pass::renderer::Renderer;
@@ -9,19 +9,19 @@ use glam::{DMat3, DVec3};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// A scene seen by one camera.
+/// Scene with one camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Workload {
-    /// For reports.
+    /// Name in reports.
     pub name: String,
-    /// The splats, at the degree to measure.
+    /// Splats, with the SH degree to measure.
     pub splats: Splats,
-    /// The camera to render and train.
+    /// Camera to render and train.
     pub camera: Camera,
 }
 
 impl Workload {
-    /// The seeded scene: `splats` splats spread evenly over a `width × height` image (see
+    /// Seeded scene: `splats` splats spread evenly over a `width × height` image (see
     /// [`seeded::benchmark`]).
     pub fn seeded(splats: usize, width: u32, height: u32, sh_degree: u32, seed: u64) -> Result<Workload> {
         if splats == 0 || width == 0 || height == 0 {
@@ -31,8 +31,8 @@ impl Workload {
         Ok(Workload { name: "seeded scene".into(), splats, camera })
     }
 
-    /// A Gaussian .ply with the camera file beside it, or a scene directory with its first camera,
-    /// or either with another camera file. `sh_degree` cuts the coefficients.
+    /// Loads a Gaussian .ply with the camera file beside it, or a scene directory with its first
+    /// camera, or either with another camera file. `sh_degree` limits the coefficients.
     pub fn load(scene: &Path, camera: Option<&Path>, sh_degree: Option<u32>) -> Result<Workload> {
         let loaded = scene_dir::load(scene)?;
         let beside: Option<PathBuf> = scene.is_file().then(|| scene.with_extension("json"));
@@ -53,7 +53,7 @@ impl Workload {
         Ok(Workload { name, splats, camera })
     }
 
-    /// One line: splats, pixels, degree.
+    /// Describes splats, pixels and degree in one line.
     pub fn describe(&self, features: usize) -> String {
         let (n, c) = (self.splats.len(), &self.camera);
         let degree = self.splats.sh_degree;
@@ -63,21 +63,22 @@ impl Workload {
         )
     }
 
-    /// The scene from its camera, on black.
+    /// Renders the scene from its camera, on black.
     pub fn render(&self, device: &Device) -> Result<RgbImage> {
         Ok(Renderer::new(device, &self.splats, &[], 0)?.render(&self.camera)?.rgb)
     }
 
-    /// The photo to fit: the scene's own render, paler, so that there is a gradient everywhere but
-    /// nothing unlike it.
+    /// Photo to fit: a paler render of the scene, so that every pixel has a gradient but the scene
+    /// stays similar.
     pub fn target(&self, device: &Device) -> Result<RgbImage> {
         let mut image = self.render(device)?;
         image.data.iter_mut().flatten().for_each(|v| *v = pale(*v));
         Ok(image)
     }
 
-    /// For other programs: `scene.ply` (INRIA fields), `scene.json` (pinhole camera, world → camera
-    /// rows) and `render.npy` ([H, W, 3] f32, on black), what they should see.
+    /// Writes the workload for other programs: `scene.ply` (INRIA fields), `scene.json` (pinhole
+    /// camera, world → camera rows) and `render.npy` ([H, W, 3] f32, on black), the expected
+    /// render.
     pub fn write(&self, device: &Device, folder: &Path) -> Result<[PathBuf; 3]> {
         create_folder(folder)?;
         let files = ["scene.ply", "scene.json", "render.npy"].map(|name| folder.join(name));
@@ -97,25 +98,25 @@ impl Workload {
     }
 }
 
-/// One of the target's colours from the rendered one.
+/// Colour of the target from the rendered one.
 fn pale(v: f32) -> f32 {
     (0.9 * v + 0.05).clamp(0.0, 1.0)
 }
 
-/// A pinhole camera as [`Workload::write`] writes it, or the first of any other camera file.
+/// Reads a pinhole camera of [`Workload::write`], or the first camera of another camera file.
 fn read_camera(path: &Path) -> Result<Camera> {
-    let bad = |what: String| {
+    let fault = |what: String| {
         Error::input(format!("{}: {what}; give the camera with --camera FILE", path.display()))
     };
     if !path.is_file() {
-        return Err(bad("there is no such file".into()));
+        return Err(fault("there is no such file".into()));
     }
     let value: serde_json::Value = files::read_json(path, "give the camera with --camera FILE")?;
     if value.get("w2c").is_none() {
-        return cameras::read(path)?.into_iter().next().ok_or_else(|| bad("no camera in it".into()));
+        return cameras::read(path)?.into_iter().next().ok_or_else(|| fault("no camera in it".into()));
     }
     let number = |v: &serde_json::Value, what: &str| {
-        v.as_f64().filter(|x| x.is_finite()).ok_or_else(|| bad(format!("{what} is no number")))
+        v.as_f64().filter(|x| x.is_finite()).ok_or_else(|| fault(format!("{what} is no number")))
     };
     let field = |name: &str| number(&value[name], name);
     let mut rotation = DMat3::IDENTITY;
@@ -136,7 +137,7 @@ fn read_camera(path: &Path) -> Result<Camera> {
         cy: field("cy")?,
         pose: Pose { rotation, translation },
     };
-    camera.checked().map_err(bad)
+    camera.checked().map_err(fault)
 }
 
 #[cfg(test)]
@@ -144,7 +145,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_seeded_scene_has_the_published_statistics() {
+    fn seeded_scene_matches_published_statistics() {
         let w = Workload::seeded(20_000, 480, 360, 1, 0).unwrap();
         let n = w.splats.len() as f64;
         let mean = |f: &dyn Fn(usize) -> f64| (0..w.splats.len()).map(f).sum::<f64>() / n;
@@ -170,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn a_written_scene_is_read_back() {
+    fn written_workload_is_read_back() {
         let folder = tempfile::tempdir().unwrap();
         let mut w = Workload::seeded(50, 64, 48, 1, 3).unwrap();
         w.camera.pose = Pose::exp(DVec3::new(0.1, 0.2, -0.3), DVec3::new(0.3, -0.2, 0.1));

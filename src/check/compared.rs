@@ -1,11 +1,11 @@
-//! What a comparison says.
+//! Results of comparisons.
 use crate::pass::close::{Tolerance, compare};
 
-/// What one comparison found: a mismatch is text, a device that fails is an [`crate::Error`]; both
-/// are wrong results.
+/// Result of one comparison: a mismatch as text, or an [`crate::Error`] of the device; both are
+/// wrong results.
 pub(super) type Found = crate::Result<Result<String, String>>;
 
-/// Compares arrays; says how close they are, or which element is not.
+/// Compares arrays: their distance, or the element that exceeds its bound.
 pub(super) fn close(
     what: &str,
     actual: &[f32],
@@ -15,7 +15,7 @@ pub(super) fn close(
     compare(actual, reference, tolerance).map(|d| d.relative_l2).map_err(|e| format!("{what}: {e}"))
 }
 
-/// Of several [`close`] the largest distance, as text.
+/// Largest of several distances of [`close`], as text.
 pub(super) fn worst(all: impl IntoIterator<Item = Result<f64, String>>) -> Result<String, String> {
     let mut worst = 0.0f64;
     for distance in all {
@@ -24,7 +24,7 @@ pub(super) fn worst(all: impl IntoIterator<Item = Result<f64, String>>) -> Resul
     Ok(format!("relative L2 error {worst:.1e}"))
 }
 
-/// Equal to the last bit.
+/// Compares arrays to the last bit.
 pub(super) fn equal<T: PartialEq + std::fmt::Debug>(
     what: &str,
     actual: &[T],

@@ -1,4 +1,4 @@
-//! Passes over arrays.
+//! Checks of passes over arrays.
 use super::compared::{Found, close, equal, worst};
 use crate::gpu::{Device, Recorder};
 use crate::math::Random;
@@ -8,7 +8,7 @@ use crate::pass::compact;
 use crate::pass::scan::{Scan, exclusive_scan};
 use crate::pass::sort::{Sort, SortAlgorithm, sort_pairs};
 
-/// A prime number of elements, more than a workgroup and no multiple of anything.
+/// A prime number of elements, more than a workgroup.
 const COUNT: usize = 20_011;
 
 fn words(count: usize, seed: u64) -> Vec<u32> {
@@ -46,14 +46,14 @@ pub(super) fn scan(device: &Device) -> Found {
     Ok(equal("total", &total.read()?, &[sum]).and(equal("starts", &starts.read()?, &expected)))
 }
 
-pub(super) fn sort(device: &Device, shape: SortAlgorithm) -> Found {
+pub(super) fn sort(device: &Device, algorithm: SortAlgorithm) -> Found {
     let mut expected: Vec<[u32; 2]> =
         words(COUNT, 3).into_iter().zip(0..).map(|(k, v)| [k >> 4, v]).collect();
     let pairs = device.buffer_from("pairs", expected.as_flattened())?;
     let count = device.buffer_from("count", &[COUNT as u32])?;
-    let sort = Sort::with(device, COUNT, shape)?;
+    let sort = Sort::with(device, COUNT, algorithm)?;
     let mut rec = Recorder::new(device, "self-check of the sort");
-    // Fewer bits than the keys have: equal ones keep their order.
+    // Fewer bits than the keys have, so that equal keys must keep their order.
     sort.record(&mut rec, &pairs, &count, 20);
     rec.run()?;
     sort_pairs(&mut expected, 20);

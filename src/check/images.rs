@@ -1,4 +1,4 @@
-//! Passes over pixels.
+//! Checks of passes over pixels.
 use super::compared::{Found, close, equal, worst};
 use crate::gpu::{Device, Recorder};
 use crate::math::Random;
@@ -41,8 +41,7 @@ pub(super) fn ssim_l1(device: &Device, rows: SsimRowKernel) -> Found {
     let loss = pass.loss([sums[0], sums[1]].map(f64::from), None);
     let (reference, by_pixel) = ssim_l1::ssim_l1(&wide(&x), &wide(&y), SIZE.0, SIZE.1, 0.8, 0.2);
     let largest = by_pixel.iter().fold(0.0f64, |m, g| m.max(g.abs()));
-    // E[x²] − E[x]² cancels about three digits in f32, and 1/C2 amplifies what is left in flat
-    // regions.
+    // E[x²] − E[x]² cancels about three digits in f32, and 1/C2 amplifies the rest in flat regions.
     let tolerance = Tolerance {
         relative_l2: 1e-3,
         absolute: 1e-3 * largest,
@@ -87,7 +86,7 @@ pub(super) fn codes(device: &Device) -> Found {
 }
 
 pub(super) fn decode(device: &Device) -> Found {
-    let mut said = Ok(String::new());
+    let mut result = Ok(String::new());
     // Once for every width that the shader is compiled for.
     for dim in [3usize, 8, 16, 24] {
         let mut random = Random::new(24 + dim as u64);
@@ -114,9 +113,9 @@ pub(super) fn decode(device: &Device) -> Found {
                 *t = a;
             }
         }
-        said = said.and(equal("codes", &actual, &reference));
+        result = result.and(equal("codes", &actual, &reference));
     }
-    Ok(said)
+    Ok(result)
 }
 
 pub(super) fn pack(device: &Device) -> Found {
@@ -129,7 +128,7 @@ pub(super) fn pack(device: &Device) -> Found {
     let frame = raster.frame();
     frame.planes.write(&planes)?;
     frame.transmittance.write(&rest)?;
-    let mut said = Ok(String::new());
+    let mut result = Ok(String::new());
     for (source, encoding) in [
         (FrameChannel::Colour, Encoding::Unorm8x4),
         (FrameChannel::Depth, Encoding::F32),
@@ -140,15 +139,15 @@ pub(super) fn pack(device: &Device) -> Found {
         pack::pack(device, frame, &frame.bands.get(0), source, encoding, &texels)?;
         let reference = pack::texels_of(&planes, &rest, source, encoding);
         let actual = texels.cast::<u8>().read()?;
-        said = said.and(match source {
+        result = result.and(match source {
             FrameChannel::Depth => quotients(&actual, &reference),
             _ => equal("bytes", &actual, &reference),
         });
     }
-    Ok(said)
+    Ok(result)
 }
 
-/// Depth is a quotient, which Vulkan lets a device round in the last two bits and a half.
+/// Compares depths: quotients, for which Vulkan allows an error of 2.5 ULP.
 fn quotients(actual: &[u8], reference: &[u8]) -> std::result::Result<String, String> {
     let floats =
         |bytes: &[u8]| -> Vec<f32> { bytes.as_chunks().0.iter().map(|b| f32::from_le_bytes(*b)).collect() };
@@ -157,15 +156,16 @@ fn quotients(actual: &[u8], reference: &[u8]) -> std::result::Result<String, Str
     worst([close("depth", &floats(actual), &wide(&floats(reference)), &tolerance)])
 }
 
-/// Two cameras side by side before a wall with noise on it.
+/// Compares stereo of two cameras side by side before a wall with noise on it.
 pub(super) fn plane_sweep(device: &Device) -> Found {
     let (width, height) = (48usize, 36usize);
     let pixels = width * height;
     let (focal, baseline, depth) = (40.0f32, 0.2f32, 2.0f32);
     let shift = (focal * baseline / depth) as usize;
     let wall = noise((width + shift) * height, 26);
-    let seen = |first: usize| (0..pixels).map(move |p| (p % width + first, p / width));
-    let luma: Vec<f32> = seen(0).chain(seen(shift)).map(|(x, y)| wall[y * (width + shift) + x]).collect();
+    let columns = |first: usize| (0..pixels).map(move |p| (p % width + first, p / width));
+    let luma: Vec<f32> =
+        columns(0).chain(columns(shift)).map(|(x, y)| wall[y * (width + shift) + x]).collect();
     let (cx, cy) = (width as f32 / 2.0, height as f32 / 2.0);
     let rows = |t: f32| [[focal, 0.0, cx, focal * t], [0.0, focal, cy, 0.0], [0.0, 0.0, 1.0, 0.0]];
     let source = |first: usize, t: f32| SourceView {
@@ -197,7 +197,7 @@ pub(super) fn plane_sweep(device: &Device) -> Found {
         cpu.sweep(r)?;
     }
     let swept = planes(&gpu.planes()?, &cpu.planes()?);
-    // From the same planes, so that ties before do not count.
+    // From the same planes, so that ties of the sweep have no influence.
     let mut gpu = GpuMatcher::new(device, &luma, &references, &sources, &cpu.planes()?)?;
     for r in references.iter().flat_map(|r| [0, 1].map(|parity| ReferenceView { parity, ..*r })) {
         gpu.refine(&r)?;
@@ -206,8 +206,8 @@ pub(super) fn plane_sweep(device: &Device) -> Found {
     Ok(swept.and(planes(&gpu.planes()?, &cpu.planes()?)))
 }
 
-/// exp, sqrt and the order of sums round differently, so that nearly equal hypotheses may win
-/// either way; anything more is wrong (the bounds of the test of stereo).
+/// Compares planes. exp, sqrt and the order of sums round differently, so nearly equal hypotheses
+/// may win either way; the bounds are those of the test of stereo.
 pub(super) fn planes(actual: &[Vec4], reference: &[Vec4]) -> std::result::Result<String, String> {
     let same = |a: &Vec4, b: &Vec4| (a.truncate() - b.truncate()).length() < 1e-4 * a.truncate().length();
     let agreeing: Vec<(&Vec4, &Vec4)> = actual.iter().zip(reference).filter(|(a, b)| same(a, b)).collect();

@@ -38,7 +38,7 @@ const fn case(pass: &'static str, variant: Option<KernelVariant>, check: fn(&Dev
     Case { pass, variant, check }
 }
 
-/// Wrong results of the first are found in nearly all others.
+/// All comparisons, in the order in which passes build on each other.
 const CASES: &[Case] = &[
     case("buffers: upload, copy, fill, download", None, data::buffers),
     case("prefix sum", None, data::scan),
@@ -89,7 +89,7 @@ pub fn run(
         }
     }
     if device.info().disabled.contains(KernelVariant::FloatAtomics.name()) {
-        // What the device is left with.
+        // The replacement of the disabled variant.
         rows.push(row(&device, &by_atomics(KernelVariant::AtomicGradients)));
         report(&rows[rows.len() - 1])?;
     }
@@ -107,18 +107,18 @@ pub fn names(variants: &BTreeSet<KernelVariant>) -> BTreeSet<String> {
     variants.iter().map(|v| v.name().to_owned()).collect()
 }
 
-/// The variants that gave wrong results and have a right replacement: those to disable.
+/// Variants to disable: those with wrong results and a correct replacement.
 pub fn wrong_variants(rows: &[Row]) -> BTreeSet<KernelVariant> {
     let wrong: BTreeSet<KernelVariant> =
         rows.iter().filter(|r| r.outcome.is_err()).filter_map(|r| r.variant).collect();
-    let replaced = |variant: &KernelVariant| {
+    let has_replacement = |variant: &KernelVariant| {
         let other = variant.replacement();
         !wrong.contains(&other) || !wrong.contains(&other.replacement())
     };
-    wrong.iter().filter(|v| replaced(v)).copied().collect()
+    wrong.iter().filter(|v| has_replacement(v)).copied().collect()
 }
 
-/// Whether a row is wrong and nothing can be used in its place.
+/// Whether a row is wrong without a replacement.
 pub fn is_fatal(row: &Row, disabled: &BTreeSet<KernelVariant>) -> bool {
     row.outcome.is_err() && row.variant.is_none_or(|v| !disabled.contains(&v))
 }

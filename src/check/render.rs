@@ -1,4 +1,4 @@
-//! Rendering and its gradients.
+//! Checks of rendering and its gradients.
 use super::compared::{Found, close, worst};
 use crate::gpu::{Device, Recorder};
 use crate::math::Random;
@@ -14,7 +14,7 @@ use crate::scene::Splats;
 use crate::scene::seeded;
 use glam::DVec3;
 
-/// The image is no multiple of the tiles.
+/// Image size in pixels, no multiple of the tile size.
 const SIZE: [u32; 2] = [75, 53];
 const FEATURES: usize = 6;
 const MODE: FeatureMode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 2 };
@@ -43,9 +43,9 @@ impl Scene {
         reference::forward(&self.params(), &self.view, MODE, &Cutoffs::STANDARD)
     }
 
-    fn rendered(&self, device: &Device, ways: DeviceChoices) -> crate::Result<(SplatBuffers, Rasterizer)> {
+    fn rendered(&self, device: &Device, choices: DeviceChoices) -> crate::Result<(SplatBuffers, Rasterizer)> {
         let params = SplatBuffers::upload(device, &self.splats, &self.features, FEATURES)?;
-        let mut raster = Rasterizer::with(device, self.splats.len(), FEATURES, SIZE[0], SIZE[1], ways)?;
+        let mut raster = Rasterizer::with(device, self.splats.len(), FEATURES, SIZE[0], SIZE[1], choices)?;
         raster.set_view(&self.view)?;
         raster.forward(&params, &self.options)?;
         Ok((params, raster))
@@ -139,7 +139,7 @@ pub(super) fn regularisers(device: &Device) -> Found {
         .iter()
         .flat_map(|s| regularise::ratio_penalty(s.map(f64::from), 0.25, 2.0).1)
         .collect();
-    // Signs and quotients of single values; where the two depths agree to rounding, the sign may
+    // Signs and quotients of single values; where the depths agree to rounding, the sign may
     // differ.
     let tolerance = Tolerance {
         relative_l2: 1e-4,

@@ -9,17 +9,17 @@ fn wrong(pass: &'static str, variant: Option<KernelVariant>) -> Row {
     Row { pass, variant, time: Duration::ZERO, outcome: Err("wrong".to_owned()) }
 }
 
-/// Also: what it does not run is only what benchmarks run.
+/// All shaders run, except those of benchmarks.
 #[test]
-fn every_pass_is_right_on_the_test_device() {
+fn every_pass_matches_its_reference() {
     let options = Options { cache: None, ..crate::gpu::options(None) };
     let device = Device::open(&options).unwrap();
-    let mut told = |row: &Row| -> Result<()> {
+    let mut report = |row: &Row| -> Result<()> {
         println!("{:<40} {:?} {:?}", row.pass, row.variant, row.outcome);
         assert!(row.outcome.is_ok(), "{}: {:?}", row.pass, row.outcome);
         Ok(())
     };
-    let rows = super::run(&device, &options, &mut told).unwrap();
+    let rows = super::run(&device, &options, &mut report).unwrap();
     assert_eq!(rows.len(), CASES.len() + 1);
     let run = device.shaders_run();
     let missing: Vec<&str> = shaders::FAMILIES
@@ -31,7 +31,7 @@ fn every_pass_is_right_on_the_test_device() {
 }
 
 #[test]
-fn a_way_is_switched_off_where_its_replacement_is_right() {
+fn wrong_variant_with_replacement_is_disabled() {
     let sweep = [wrong("radix sort", Some(KernelVariant::SweepSort))];
     assert_eq!(wrong_variants(&sweep), BTreeSet::from([KernelVariant::SweepSort]));
     assert!(!is_fatal(&sweep[0], &wrong_variants(&sweep)));
@@ -45,7 +45,7 @@ fn a_way_is_switched_off_where_its_replacement_is_right() {
 }
 
 #[test]
-fn native_float_atomics_are_switched_off_alone_if_it_goes_without_them() {
+fn wrong_float_atomics_are_disabled_alone() {
     let native = wrong("gradients", Some(KernelVariant::FloatAtomics));
     assert_eq!(wrong_variants(std::slice::from_ref(&native)), BTreeSet::from([KernelVariant::FloatAtomics]));
     let mut rows = vec![native, wrong("gradients", Some(KernelVariant::AtomicGradients))];
@@ -59,19 +59,19 @@ fn native_float_atomics_are_switched_off_alone_if_it_goes_without_them() {
 }
 
 #[test]
-fn it_ends_where_the_caller_says_so() {
+fn error_of_report_ends_the_check() {
     let options = Options { cache: None, ..crate::gpu::options(None) };
     let device = Device::open(&options).unwrap();
-    let mut told = 0;
+    let mut reported = 0;
     let stopped = run(&device, &options, &mut |_| {
-        told += 1;
-        if told == 2 { Err(crate::Error::Cancelled) } else { Ok(()) }
+        reported += 1;
+        if reported == 2 { Err(crate::Error::Cancelled) } else { Ok(()) }
     });
-    assert!(matches!(stopped, Err(crate::Error::Cancelled)) && told == 2);
+    assert!(matches!(stopped, Err(crate::Error::Cancelled)) && reported == 2);
 }
 
 #[test]
-fn wrong_results_are_told_apart_from_right_ones() {
+fn comparisons_detect_wrong_results() {
     let tolerance =
         Tolerance { relative_l2: 1e-3, absolute: 1e-3, relative: 1e-3, outliers: 0.0, outlier_factor: 1.0 };
     assert!(worst([close("a", &[1.0], &[1.0], &tolerance)]).is_ok());
@@ -82,7 +82,7 @@ fn wrong_results_are_told_apart_from_right_ones() {
 }
 
 #[test]
-fn planes_may_differ_where_two_are_nearly_as_good_and_nowhere_else() {
+fn planes_beyond_near_ties_are_wrong() {
     let reference = [Vec4::new(0.1, 0.0, 0.5, 0.2); 1000];
     let with = |count: usize, change: Vec4| {
         let mut actual = reference;
@@ -94,7 +94,7 @@ fn planes_may_differ_where_two_are_nearly_as_good_and_nowhere_else() {
     assert!(with(1, 0.01 * Vec4::W).unwrap_err().contains("costs differ"));
 }
 
-/// A device that fails at everything.
+/// An executor that fails every run.
 struct Broken;
 
 impl Executor for Broken {
@@ -104,7 +104,7 @@ impl Executor for Broken {
 }
 
 #[test]
-fn after_a_wrong_way_the_device_is_opened_anew_without_it() {
+fn device_is_reopened_without_wrong_variant() {
     let options = Options { cache: None, staging: false, ..crate::gpu::options(None) };
     let device = TestDevice::executed_by(Box::new(Broken), 32, &options).unwrap();
     let mut seen = Vec::new();
@@ -113,7 +113,7 @@ fn after_a_wrong_way_the_device_is_opened_anew_without_it() {
         if seen.len() == 4 { Err(crate::Error::Cancelled) } else { Ok(()) }
     });
     assert!(matches!(stopped, Err(crate::Error::Cancelled)));
-    // Nothing replaces what came before the sorts; the one that is opened now is not broken.
+    // The passes before the sorts have no replacement; the reopened device has no broken executor.
     let expected = [
         (None, false),
         (None, false),

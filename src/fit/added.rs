@@ -1,7 +1,7 @@
-//! A scene that goes on with more photos (docs/internals/method.md#photos-added-later): its splats
-//! stay and train on, surfaces that it does not have yet become new ones.
+//! Training of a scene with photos added later (docs/internals/method.md#photos-added-later): its
+//! splats are trained further, and surfaces that it lacks become new splats.
 use super::bounds::Bounds;
-use super::coarse::Photos;
+use super::half_res::Photos;
 use super::init::{raise_sh_degree, splats_from_points};
 use super::options::RgbOptions;
 use super::rgb::{Trained, fit_photos};
@@ -13,16 +13,16 @@ use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, Image, PointCloud, Splats};
 use glam::DVec3;
 
-/// Relative difference in depth from which on a point is on another surface than the one that is
-/// rendered: what occlusion tests between views allow (docs/internals/method.md#reprojection).
+/// Relative depth difference from which a point is on another surface than the rendered one: the
+/// tolerance of occlusion tests between views (docs/internals/method.md#reprojection).
 const SAME_SURFACE: f64 = 0.05;
 
-/// Fewest points that splats are made of.
+/// Fewest points that become splats.
 const MIN_POINTS: usize = 4;
 
-/// The points on surfaces that a scene does not have: those that a new view measures where the
-/// scene renders nothing, or something clearly nearer or farther. `views` are new cameras, each
-/// with the depth that was measured in it and what the scene renders there.
+/// Points on surfaces that a scene lacks: those that a new view measures where the scene renders
+/// nothing, or a surface that is clearly nearer or farther. `views` are new cameras, each with its
+/// measured depth and the depth that the scene renders.
 pub fn new_surface(points: &PointCloud, views: &[(&Camera, &DepthMap, &Image<f32>)]) -> PointCloud {
     let is_new = |i: usize| {
         let p = DVec3::from(points.positions[i].map(f64::from));
@@ -41,8 +41,8 @@ pub fn new_surface(points: &PointCloud, views: &[(&Camera, &DepthMap, &Image<f32
     points.picked(&rows)
 }
 
-/// Trains on: `scene` are the splats that photos show, `fresh` points of new surfaces; `photos` are
-/// those of the scene first.
+/// Continues training: `scene` are the splats that photos show, `fresh` the points of new surfaces.
+/// `photos` begin with those of the scene.
 pub(crate) fn train_on(
     device: &Device,
     photos: Photos,
@@ -52,24 +52,26 @@ pub(crate) fn train_on(
     progress: &dyn Progress,
 ) -> Result<Trained> {
     let mut start = scene;
-    let join = |start: &mut Splats, mut more: Splats| {
-        raise_sh_degree(&mut more, start.sh_degree);
-        start.append(more);
-    };
     if fresh.len() >= MIN_POINTS {
-        join(&mut start, splats_from_points(fresh, &options.init, options.seed)?);
+        append_splats(&mut start, splats_from_points(fresh, &options.init, options.seed)?);
     }
     let surfaces = start.means.clone();
     let Photos { images, cameras, depths, .. } = photos;
     if let Some(depths) = depths.filter(|_| options.margin > 0.0 && !photos.show_emptiness()) {
         let (reach, confidence) = (options.margin, options.min_confidence);
-        join(&mut start, unseen_splats(images, cameras, depths, reach, confidence, options.seed));
+        append_splats(&mut start, unseen_splats(images, cameras, depths, reach, confidence, options.seed));
     }
     if options.bounded {
-        start = Bounds::new(cameras, &surfaces).hold(start);
+        start = Bounds::new(cameras, &surfaces).clamp_to_bounds(start);
     }
     let scale = SceneScale::measure(cameras, &surfaces);
     fit_photos(device, photos, start, scale, options, progress)
+}
+
+/// Appends splats of a lower or equal SH degree.
+fn append_splats(start: &mut Splats, mut more: Splats) {
+    raise_sh_degree(&mut more, start.sh_degree);
+    start.append(more);
 }
 
 #[cfg(test)]
@@ -78,7 +80,7 @@ mod tests {
     use crate::scene::Pose;
 
     #[test]
-    fn only_what_the_scene_does_not_have_is_new() {
+    fn new_surface_excludes_rendered_surfaces() {
         let camera = Camera {
             name: String::new(),
             width: 4,
@@ -89,8 +91,8 @@ mod tests {
             cy: 0.5,
             pose: Pose::IDENTITY,
         };
-        // Pixel 0 is rendered where it was measured, 1 behind, 2 not at all; 3 was measured
-        // elsewhere.
+        // Pixel 0 is rendered at the measured depth, 1 behind it, 2 not at all; the point of 3 is
+        // not at the measured depth.
         let measured = DepthMap {
             depth: Image { width: 4, height: 1, data: vec![2.0, 2.0, 2.0, 1.0] },
             confidence: Image { width: 4, height: 1, data: vec![0.9; 4] },

@@ -1,5 +1,5 @@
-//! What LEGaussians does to features after they are splatted: smoothing in space, and a head that
-//! reads the index of a codebook entry from a rendered feature (Shi et al. 2024).
+//! Features as in LEGaussians (Shi et al. 2024): smoothing in space, and a head that classifies
+//! rendered features as codebook entries.
 use crate::math::Random;
 use crate::scene::{Codebook, Splats};
 use rayon::prelude::*;
@@ -10,15 +10,15 @@ const LEAST_SMOOTHING: f32 = 0.1;
 /// Side of a neighbourhood in units of the scene extent: a few times the distance between splats of
 /// a draft scene.
 const NEIGHBOURHOOD: f64 = 0.01;
-/// Gradient steps of the head and their rate; the loss of a few thousand samples is flat after
-/// that.
+/// Gradient steps of the head; the loss of a few thousand samples is flat after that.
 const STEPS: usize = 150;
+/// Learning rate of the head.
 const RATE: f32 = 0.05;
 /// Samples per step.
 const BATCH: usize = 1024;
 
-/// Moves every splat's feature `[N, d]` towards the mean of its neighbourhood, by as much as it
-/// disagrees with it and at least by a tenth; lengths stay.
+/// Moves the feature of every splat, `[N, d]`, towards the mean of its neighbourhood by 1 − cosine,
+/// at least a tenth; lengths stay.
 pub fn smooth(splats: &Splats, features: &mut [f32], d: usize, extent: f64) {
     let side = (NEIGHBOURHOOD * extent) as f32;
     if d == 0 || side <= 0.0 {
@@ -30,7 +30,6 @@ pub fn smooth(splats: &Splats, features: &mut [f32], d: usize, extent: f64) {
         let sum = sums.entry(cell(mean)).or_insert_with(|| vec![0.0; d]);
         sum.iter_mut().zip(f).for_each(|(s, v)| *s += v);
     }
-    let length = |v: &[f32]| v.iter().map(|x| x * x).sum::<f32>().sqrt();
     features.par_chunks_exact_mut(d).zip(&splats.means).for_each(|(f, mean)| {
         let (own, Some(sum)) = (length(f), sums.get(&cell(mean))) else { return };
         let around = length(sum);
@@ -45,16 +44,20 @@ pub fn smooth(splats: &Splats, features: &mut [f32], d: usize, extent: f64) {
     });
 }
 
-/// Trains the rows of a linear softmax head, [K, d], on rendered features and the entries they
-/// should name; the rows take the place of the codes, so that the most probable entry is the
-/// decoded one.
+/// Length of a vector.
+fn length(v: &[f32]) -> f32 {
+    v.iter().map(|x| x * x).sum::<f32>().sqrt()
+}
+
+/// Trains the rows of a linear softmax head, [K, d], on rendered features and the indices of their
+/// entries. The rows replace the codes, so that decoding gives the most probable entry.
 pub fn train_head(book: &mut Codebook, features: &[f32], labels: &[u32], seed: u64) {
     let (d, k) = (book.code_dim, book.len());
     if labels.is_empty() || k == 0 {
         return;
     }
     let mut random = Random::new(seed ^ 0x4ead);
-    // Logits of unit features between unit rows are too flat to start from.
+    // Logits of unit features and unit rows are too flat to start from.
     let mut rows: Vec<f32> = book.codes.iter().map(|v| 5.0 * v).collect();
     let (mut first, mut second) = (vec![0.0f32; rows.len()], vec![0.0f32; rows.len()]);
     for step in 1..=STEPS {
@@ -87,7 +90,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_head_learns_to_name_entries_that_the_start_confuses() {
+    fn train_head_learns_confused_entries() {
         let d = 4;
         let mut random = Random::new(1000);
         let directions: Vec<Vec<f32>> =
@@ -102,7 +105,7 @@ mod tests {
             embedding_dim: 1,
             code_dim: d,
             embeddings: vec![1.0; 6],
-            // directions that say nothing about the features
+            // Directions that are independent of the features.
             codes: (0..6 * d).map(|_| random.normal() as f32).collect(),
             ..Codebook::default()
         };
@@ -116,7 +119,7 @@ mod tests {
     }
 
     #[test]
-    fn smoothing_turns_the_odd_one_and_keeps_lengths() {
+    fn smooth_turns_outlier_keeps_lengths() {
         let splats = Splats { means: vec![[0.001; 3]; 9], ..Splats::default() };
         let mut features: Vec<f32> = [[1.0, 0.0]; 8].concat();
         features.extend([0.0, 2.0]);
@@ -127,7 +130,7 @@ mod tests {
             "{odd:?}"
         );
         assert!(features[0] > 0.999, "the many hardly move: {:?}", &features[..2]);
-        // splats far apart leave each other alone
+        // Distant splats do not affect each other.
         let apart = Splats { means: vec![[0.0; 3], [1.0; 3]], ..Splats::default() };
         let mut two = vec![1.0, 0.0, 0.0, 1.0];
         smooth(&apart, &mut two, 2, 1.0);

@@ -23,8 +23,7 @@ pub fn splats_from_points(points: &PointCloud, options: &InitOptions, seed: u64)
     let positions: Vec<Vec3> = keep.iter().map(|&i| Vec3::from(points.positions[i])).collect();
     let spacing = neighbour_distances(&positions);
     let logit = (options.opacity / (1.0 - options.opacity)).ln();
-    // Thinning spreads the same surface over fewer splats: each must cover proportionally more of
-    // it.
+    // Thinning leaves fewer splats for the same surface: each must cover proportionally more of it.
     let grow = (points.len() as f32 / keep.len() as f32).sqrt();
     let mut splats = Splats { sh_degree: 0, ..Splats::default() };
     for (n, &i) in keep.iter().enumerate() {
@@ -58,15 +57,15 @@ pub fn raise_sh_degree(splats: &mut Splats, degree: u32) {
 }
 
 /// Reduces `candidates` to at most `max` points: the most confident point of every voxel, in voxels
-/// just large enough, then random ones up to the cap. Thin and far regions stay covered.
+/// just large enough, then random points up to `max`. Sparse and far regions stay covered.
 fn thin(points: &PointCloud, mut candidates: Vec<usize>, max: usize, seed: u64) -> Vec<usize> {
     if candidates.len() <= max {
         return candidates;
     }
     Random::new(seed).shuffle(&mut candidates);
     // The voxel edge is in pixel footprints: on a surface with one point per footprint, a voxel of
-    // edge √ratio holds `ratio` points. Overlapping views hold more, so start there and grow until
-    // the voxels fit under the cap.
+    // edge √ratio holds `ratio` points. Overlapping views have more points, so the edge starts
+    // there and grows until the number of voxels is at most `max`.
     let mut edge = (candidates.len() as f32 / max as f32).sqrt() * 0.7;
     let mut best = occupied(points, &candidates, edge);
     while best.len() > max {
@@ -82,13 +81,13 @@ fn thin(points: &PointCloud, mut candidates: Vec<usize>, max: usize, seed: u64) 
     keep
 }
 
-/// The most confident candidate of every occupied voxel of `edge` pixel footprints.
+/// Most confident candidate of every occupied voxel of `edge` pixel footprints.
 fn occupied(points: &PointCloud, candidates: &[usize], edge: f32) -> HashMap<[i64; 4], usize> {
     let confidence = |j: usize| points.confidence.get(j).copied().unwrap_or(0.0);
     let mut best: HashMap<[i64; 4], usize> = HashMap::new();
     for &i in candidates {
         let radius = points.radius.get(i).copied().filter(|r| *r > 0.0 && r.is_finite()).unwrap_or(1e-3);
-        // Octaves of the footprint, so near and far surfaces are both thinned in image space.
+        // By octaves of the footprint, so that near and far surfaces are thinned in image space.
         let octave = radius.log2().round();
         let cell = octave.exp2() * edge;
         let p = points.positions[i].map(|v| (v / cell).floor() as i64);
@@ -113,8 +112,7 @@ pub fn neighbour_distances(positions: &[Vec3]) -> Vec<f32> {
         .collect()
 }
 
-/// A balanced k-d tree over point indices: the median of each range splits it along its widest
-/// axis.
+/// Balanced k-d tree over point indices: the median of each range splits it along its widest axis.
 struct KdTree<'a> {
     positions: &'a [Vec3],
     order: Vec<u32>,
@@ -146,7 +144,7 @@ impl<'a> KdTree<'a> {
         axes[middle] = axis as u8;
         let (left, right) = order.split_at_mut(middle);
         let (left_axes, right_axes) = axes.split_at_mut(middle);
-        // Below a few thousand points a task costs more than it saves.
+        // A parallel task for fewer points costs more than it saves.
         if left.len() > 4096 {
             rayon::join(
                 || Self::build(positions, left, left_axes),
@@ -158,8 +156,7 @@ impl<'a> KdTree<'a> {
         }
     }
 
-    /// Squared distances to the three nearest points other than `skip`, infinite when there are
-    /// fewer.
+    /// Squared distances to the three nearest points other than `skip`; infinite for missing ones.
     fn nearest(&self, query: Vec3, skip: usize) -> [f32; 3] {
         let mut best = [f32::INFINITY; 3];
         self.search(query, skip as u32, 0, self.order.len(), &mut best);
@@ -216,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn neighbours_match_brute_force() {
+    fn neighbour_distances_match_brute_force() {
         let points = cloud(700, 3);
         let positions: Vec<Vec3> = points.positions.iter().map(|p| Vec3::from(*p)).collect();
         for (i, got) in neighbour_distances(&positions).into_iter().enumerate() {
@@ -231,7 +228,7 @@ mod tests {
     }
 
     #[test]
-    fn splats_keep_colour_and_respect_both_size_limits() {
+    fn new_splats_keep_colour_within_sizes() {
         let points = cloud(200, 5);
         let options = InitOptions { max_points: 1000, opacity: 0.3, footprint: 0.5, neighbours: 1.0 };
         let splats = splats_from_points(&points, &options, 0).unwrap();
@@ -249,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn thinning_keeps_the_cap_and_sparse_regions() {
+    fn thinning_limits_count_keeps_sparse_regions() {
         let mut points = cloud(4000, 9);
         points.positions[77] = [50.0, 50.0, 50.0];
         let options = InitOptions { max_points: 500, opacity: 0.5, footprint: 0.7, neighbours: 1.0 };
@@ -260,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn raising_the_degree_keeps_the_colours() {
+    fn raise_sh_degree_keeps_colours() {
         let mut splats =
             Splats { means: vec![[0.0; 3]; 2], sh: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0], ..Splats::default() };
         raise_sh_degree(&mut splats, 1);
@@ -272,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn too_few_or_broken_points_are_an_error() {
+    fn too_few_valid_points_fail() {
         let mut points = cloud(5, 1);
         points.positions[0][1] = f32::NAN;
         points.colours[1][0] = f32::INFINITY;

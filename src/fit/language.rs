@@ -1,7 +1,7 @@
-//! The language stage: features on the splats that render to each pixel's code
-//! (docs/internals/method.md#language-training), `L = λ2·L_img + (1−λ2)·L_sem`, starting from
-//! lifted features.
-use super::coarse::Photos;
+//! Language stage: trains features of splats to render to the code of each pixel
+//! (docs/internals/method.md#language-training), `L = λ2·L_img + (1−λ2)·L_sem`, from lifted
+//! features.
+use super::half_res::Photos;
 use super::least_squares;
 use super::lift::{CodeTargets, Lifting};
 use super::model::{Model, not_finite};
@@ -20,11 +20,11 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// L_img in this stage weighs L1 and D-SSIM as in the first (the paper).
+/// Weights of L1 and D-SSIM in L_img, as in the colour stage (the paper).
 const IMAGE_WEIGHTS: [f64; 2] = [0.8, 0.2];
-/// Slots of the loss sums: Σ|x−y|, ΣSSIM, language loss.
+/// Slot of the language loss in the loss sums; Σ|x−y| and ΣSSIM precede it.
 const LANGUAGE_SUM: u32 = 2;
-/// Two measurements that gain less than this share of the pixels end the training
+/// Least gain of decode accuracy over two measurements; a smaller gain ends the training
 /// (docs/internals/method.md#stopping).
 const MIN_GAIN: f64 = 1e-3;
 
@@ -37,7 +37,7 @@ pub struct LanguagePoint {
     /// Mean L_sem since the last point.
     pub loss: f64,
     /// Share of labelled training pixels that decode to their label, index as in [`LEVEL_NAMES`];
-    /// `None` for levels that the model does not carry.
+    /// `None` for levels without features in the model.
     pub accuracy: Vec<Option<f64>>,
 }
 
@@ -49,21 +49,22 @@ impl LanguagePoint {
     }
 }
 
-/// What was measured last of a level's decode accuracy.
+/// Last measured decode accuracy of a level.
 pub fn decode_accuracy(curve: &[LanguagePoint], level: usize) -> Option<f64> {
     curve.iter().rev().find_map(|p| *p.accuracy.get(level)?)
 }
 
-/// The result of the language stage.
+/// Result of the language stage.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct TrainedLanguage {
-    /// Splats of the shared model; those given, where every level has its own
+    /// Splats of the shared model; with `per_level` the given splats, since every level has its own
     /// ([`LevelField::splats`]).
     pub splats: Splats,
-    /// The field given, with features [N, d] as they are rendered (linear blending).
+    /// The given field, with features [N, d] as rendered (linear blending).
     pub field: LanguageField,
-    /// Measurements; with `per_level` those of all levels one after the other, steps counted on.
+    /// Measurements; with `per_level` those of all levels one after the other, with continued
+    /// steps.
     pub curve: Vec<LanguagePoint>,
     /// Wall-clock time, seconds.
     pub seconds: f64,
@@ -83,7 +84,7 @@ pub fn train_language(
     train_language_of(device, photos, splats, field, options, progress)
 }
 
-/// [`train_language`] of photos of which not all pixels may count.
+/// [`train_language`] with the coverage of the photos.
 pub(crate) fn train_language_of(
     device: &Device,
     photos: Photos,
@@ -112,7 +113,7 @@ pub(crate) fn train_language_of(
         out.curve.extend(run.curve.drain(..).map(|p| LanguagePoint { step: before + p.step, ..p }));
         let features = features.into_iter().zip(std::mem::take(&mut run.reliability));
         for (&level, (features, reliability)) in group.iter().zip(features) {
-            out.field.levels[level].carry(features);
+            out.field.levels[level].set_features(features);
             out.field.levels[level].reliability = reliability;
         }
         match group.as_slice() {
@@ -125,25 +126,25 @@ pub(crate) fn train_language_of(
     Ok(out)
 }
 
-/// The training of one model: all levels together, or one.
+/// Training of one model, with all levels or one.
 pub(crate) struct Run<'a> {
     trainer: Trainer,
     options: &'a LanguageOptions,
-    /// With their index in the field.
+    /// Levels with their index in the field.
     levels: Vec<(usize, &'a LevelField)>,
     width: usize,
     extent: f64,
     targets: CodeTargets,
     losses: Vec<Buffer<f32>>,
     partials: Buffer<f32>,
-    /// Per level, [N].
+    /// Reliability per level, [N].
     reliability: Vec<Vec<f32>>,
     /// Losses since the last measurement.
     recent: Vec<f64>,
     curve: Vec<LanguagePoint>,
 }
 
-/// What steps change beside the model.
+/// State of the stage besides the model, for checkpoints.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct StageState {
     recent: Vec<f64>,
@@ -208,7 +209,7 @@ impl<'a> Run<'a> {
         })
     }
 
-    /// True when the last two measurements together gained less than [`MIN_GAIN`].
+    /// True when the last two measurements gained less than [`MIN_GAIN`].
     fn settled(&self) -> bool {
         match self.curve.as_slice() {
             [.., a, b, c] => c.mean_accuracy().max(b.mean_accuracy()) - a.mean_accuracy() < MIN_GAIN,
@@ -230,7 +231,7 @@ impl<'a> Run<'a> {
                     let labels = frame.bands.cut_inner(band, &labels.data, -1);
                     let first = (BASE_CHANNELS + l * width) * pixels;
                     let block = frame.planes.read_range(first..first + width * pixels)?;
-                    let [right, valid] = decoded_right(level, &labels, &block);
+                    let [right, valid] = count_decoded(level, &labels, &block);
                     counts[l][0] += right;
                     counts[l][1] += valid;
                 }
@@ -268,9 +269,9 @@ impl<'a> Run<'a> {
             let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
             feature.iter_mut().for_each(|v| *v /= norm + self.options.epsilon);
         }
-        let level =
+        let features_of =
             |l: usize| all.chunks_exact(levels * d).flat_map(move |f| &f[l * d..(l + 1) * d]).copied();
-        Ok((splats, (0..levels).map(|l| level(l).collect()).collect()))
+        Ok((splats, (0..levels).map(|l| features_of(l).collect()).collect()))
     }
 }
 
@@ -339,7 +340,7 @@ impl Training for Run<'_> {
 
     fn review(&mut self, step: usize) -> Result<StepReport> {
         let LanguageOptions { check_every: every, iterations: last, .. } = *self.options;
-        // A run that is measured once, at its end, needs no start to compare with.
+        // A run that is measured only at its end needs no measurement at its start.
         let due = step == last || (step.is_multiple_of(every) && every < last);
         if every == 0 || !due {
             return Ok(StepReport::default());
@@ -347,8 +348,8 @@ impl Training for Run<'_> {
         self.trainer.model.check(step)?;
         let point = self.measure(step)?;
         let figures = vec![("loss", point.loss), ("accuracy", point.mean_accuracy())];
-        let share = |(name, a): (&str, &Option<f64>)| a.map(|a| format!("{name} {:.1} %", 100.0 * a));
-        let shares: Vec<String> = LEVEL_NAMES.into_iter().zip(&point.accuracy).filter_map(share).collect();
+        let percent = |(name, a): (&str, &Option<f64>)| a.map(|a| format!("{name} {:.1} %", 100.0 * a));
+        let shares: Vec<String> = LEVEL_NAMES.into_iter().zip(&point.accuracy).filter_map(percent).collect();
         let note = Some(format!("decoded: {}", shares.join(", ")));
         self.curve.push(point);
         Ok(StepReport { figures, note, finished: self.settled() })
@@ -363,8 +364,8 @@ impl Training for Run<'_> {
     }
 }
 
-/// (pixels that decode to their label, labelled pixels) of planar features [d, H·W].
-fn decoded_right(level: &LevelField, labels: &[i32], features: &[f32]) -> [usize; 2] {
+/// Counts (pixels that decode to their label, labelled pixels) of planar features [d, H·W].
+fn count_decoded(level: &LevelField, labels: &[i32], features: &[f32]) -> [usize; 2] {
     let pixels = labels.len();
     let d = level.codebook.code_dim;
     labels

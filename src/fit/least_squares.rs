@@ -1,39 +1,39 @@
-//! Features in closed form: those whose blend is nearest to the codes of all labelled pixels
+//! Features by linear least squares: their blend is nearest to the codes of all labelled pixels
 //! (docs/internals/method.md#lifting).
 use super::lift::{Lifted, Lifting, MIN_WEIGHT, unit_start};
 use crate::Result;
 use crate::pass::codes::Mode;
 use rayon::prelude::*;
 
-/// Steps of conjugate gradients; a step costs a forward and a backward pass per photo, so that
-/// these cost about as much as the draft preset's training. Not searched
+/// Steps of conjugate gradients. A step costs a forward and a backward pass per photo, so these
+/// cost about as much as training with the draft preset. Not searched
 /// (docs/internals/experiments.md#measured-lifting).
 const SOLVER_STEPS: usize = 8;
 
-/// λ: how much a splat's own mean counts beside what its pixels ask for, as a share of its blending
-/// weight. A tenth leaves what pixels agree on to them and decides what they leave open. Not
-/// searched (docs/internals/experiments.md#measured-lifting).
+/// λ: weight of the prior, the mean code of a splat, as a share of its blending weight. With a
+/// tenth, pixels determine the features where they agree, and the prior where they leave them open.
+/// Not searched (docs/internals/experiments.md#measured-lifting).
 const PRIOR: f32 = 0.1;
 
-/// Sets the model's raw features to the solution of `min_f Σ_px |Σ_i w_i f_i − c|² + λ Σ_i W_i |f_i
-/// − m_i|²`, with W_i the blending weight of splat i over the labelled pixels and m_i the mean of
-/// the codes it is seen with, and with the length that training starts from.
+/// Sets the raw features of the model to the solution of
+/// `min_f Σ_px |Σ_i w_i f_i − c|² + λ Σ_i W_i |f_i − m_i|²`, scaled to the length that training
+/// starts from. W_i is the blending weight of splat i over the labelled pixels and m_i the mean of
+/// the codes of its pixels.
 pub(super) fn solve(lifting: &mut Lifting, lifted: &Lifted) -> Result<()> {
     let width = lifting.targets.width();
     // W for every value; 0 keeps the values of splats that no labelled pixel shows at zero.
-    let known = |w: &f32| if *w > MIN_WEIGHT { *w } else { 0.0 };
+    let usable = |w: &f32| if *w > MIN_WEIGHT { *w } else { 0.0 };
     let weights: Vec<f32> =
-        lifted.weights.iter().map(known).flat_map(|w| std::iter::repeat_n(w, width)).collect();
-    let over = |v: &f32, w: &f32| if *w > 0.0 { v / w } else { 0.0 };
-    let mean: Vec<f32> = lifted.sums.par_iter().zip(&weights).map(|(s, w)| over(s, w)).collect();
+        lifted.weights.iter().map(usable).flat_map(|w| std::iter::repeat_n(w, width)).collect();
+    let mean: Vec<f32> = lifted.sums.par_iter().zip(&weights).map(|(s, w)| quotient(s, w)).collect();
     let mut x = mean;
-    // The right-hand side is Aᵀc + λWm = (1 + λ) Aᵀc where the splat is known.
+    // The right-hand side is Aᵀc + λWm = (1 + λ) Aᵀc where W > 0.
     let applied = apply(lifting, lifted, &weights, &x)?;
-    let right = |(s, w): (&f32, &f32)| if *w > 0.0 { (1.0 + PRIOR) * s } else { 0.0 };
+    let right_hand_side = |(s, w): (&f32, &f32)| if *w > 0.0 { (1.0 + PRIOR) * s } else { 0.0 };
     let mut residual: Vec<f32> =
-        lifted.sums.par_iter().zip(&weights).map(right).zip(&applied).map(|(b, a)| b - a).collect();
+        lifted.sums.par_iter().zip(&weights).map(right_hand_side).zip(&applied).map(|(b, a)| b - a).collect();
     let precondition = |r: &[f32]| -> Vec<f32> {
-        r.par_iter().zip(&weights).map(|(r, w)| over(r, &((1.0 + PRIOR) * w))).collect()
+        r.par_iter().zip(&weights).map(|(r, w)| quotient(r, &((1.0 + PRIOR) * w))).collect()
     };
     let mut z = precondition(&residual);
     let mut direction = z.clone();
@@ -41,7 +41,7 @@ pub(super) fn solve(lifting: &mut Lifting, lifted: &Lifted) -> Result<()> {
     for _ in 0..SOLVER_STEPS {
         let applied = apply(lifting, lifted, &weights, &direction)?;
         let curvature = dot(&direction, &applied);
-        // False for what is not a number, too: what was reached stays.
+        // False for NaN, too: the solution so far stays.
         let descends = curvature > 0.0 && energy > 0.0;
         if !descends {
             break;
@@ -51,23 +51,28 @@ pub(super) fn solve(lifting: &mut Lifting, lifted: &Lifted) -> Result<()> {
         residual.par_iter_mut().zip(&applied).for_each(|(r, a)| *r -= step * a);
         z = precondition(&residual);
         let next = dot(&residual, &z);
-        let turn = (next / energy) as f32;
-        direction.par_iter_mut().zip(&z).for_each(|(d, z)| *d = z + turn * *d);
+        let beta = (next / energy) as f32;
+        direction.par_iter_mut().zip(&z).for_each(|(d, z)| *d = z + beta * *d);
         energy = next;
     }
     Ok(lifting.model.values.features.write(&unit_start(x, width))?)
 }
 
-/// `(AᵀA + λW) v`, with A the blending of all labelled pixels. Photos give `AᵀA v − Aᵀc`, and Aᵀc
-/// is what was lifted.
+/// `v / w`, or 0 where w = 0.
+fn quotient(v: &f32, w: &f32) -> f32 {
+    if *w > 0.0 { v / w } else { 0.0 }
+}
+
+/// `(AᵀA + λW) v`, with A the blending of all labelled pixels. The photos give `AᵀA v − Aᵀc`, and
+/// Aᵀc are the lifted sums.
 fn apply(lifting: &mut Lifting, lifted: &Lifted, weights: &[f32], v: &[f32]) -> Result<Vec<f32>> {
     lifting.model.values.features.write(v)?;
     let mut sums = lifted.sums.clone();
     for view in 0..lifting.cameras.len() {
-        lifting.back(view, Mode::Residual, &mut sums)?;
+        lifting.add_gradients(view, Mode::Residual, &mut sums)?;
     }
-    let one = |((s, w), v): ((&f32, &f32), &f32)| if *w > 0.0 { s + PRIOR * w * v } else { 0.0 };
-    Ok(sums.par_iter().zip(weights).zip(v).map(one).collect())
+    let with_prior = |((s, w), v): ((&f32, &f32), &f32)| if *w > 0.0 { s + PRIOR * w * v } else { 0.0 };
+    Ok(sums.par_iter().zip(weights).zip(v).map(with_prior).collect())
 }
 
 fn dot(a: &[f32], b: &[f32]) -> f64 {
@@ -116,9 +121,9 @@ mod tests {
             LanguageOptions { start: Start::LeastSquares, ..LanguageOptions::preset(Preset::Draft) };
         let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
         let run = LanguageRun::new(&device, photos, &splats, &[(0, &level)], &options, &Silent).unwrap();
-        let (_, found) = run.trainer().parts().params.download().unwrap();
+        let (_, found) = run.trainer().step_resources().params.download().unwrap();
 
-        // How much every pixel shows of each splat.
+        // Blending weight of each splat in every pixel.
         let raster = RasterOptions { feature_mode: FeatureMode::Linear, ..RasterOptions::default() };
         let one_each = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
         let mut renderer = Renderer::new(&device, &splats, &one_each, 3).unwrap().with_options(raster);

@@ -1,5 +1,5 @@
-//! Code targets in GPU memory, and lifting: the blending-weighted mean of the codes that each splat
-//! is seen with (docs/internals/method.md#lifting).
+//! Code targets in GPU memory, and lifting: the blending-weighted mean of the codes of the pixels
+//! of each splat (docs/internals/method.md#lifting).
 use super::model::Model;
 use super::views::Views;
 use crate::gpu::{self, Buffer, Device, Recorder};
@@ -10,10 +10,10 @@ use crate::progress::Progress;
 use crate::scene::{Camera, LevelField, RgbImage};
 use crate::{Error, Result};
 
-/// Splats that labelled pixels saw with less weight than this (in pixels) start without a feature:
-/// their direction would be noise (docs/internals/method.md#lifting).
+/// Least blending weight over labelled pixels, in pixels; splats with less start without a feature,
+/// whose direction would be noise (docs/internals/method.md#lifting).
 pub(super) const MIN_WEIGHT: f32 = 0.05;
-/// Length of a lifted raw feature: far above ε, so steps turn it without collapsing it.
+/// Length of a lifted raw feature: far above ε, so that steps rotate it without collapsing it.
 const LIFTED_LENGTH: f32 = 0.5;
 
 /// Labels, codes and loss weights of all views and levels.
@@ -22,15 +22,15 @@ pub(super) struct CodeTargets {
     width: u32,
     /// [ΣK, d], all levels.
     codes: Buffer<f32>,
-    /// Per view and band: [levels, rows·W] rows of `codes`, −1 = none, or another band's.
+    /// Per view and band: [levels, rows·W] rows of `codes`, −1 = none or halo.
     labels: Vec<Vec<Buffer<i32>>>,
     /// Per view: [levels] weight of one labelled value.
     weights: Vec<Buffer<f32>>,
 }
 
 impl CodeTargets {
-    /// Checks and uploads the targets. `weight` is that of L_sem, the mean over levels of the mean
-    /// absolute difference over labelled pixels and channels.
+    /// Checks and uploads the targets. `weight` is the weight of L_sem, the mean over levels of the
+    /// mean absolute difference over labelled pixels and channels.
     pub(super) fn new(
         device: &Device,
         levels: &[&LevelField],
@@ -72,7 +72,7 @@ impl CodeTargets {
         self.width as usize
     }
 
-    /// What the language loss of one band of a view reads.
+    /// Targets of the language loss in one band of a view.
     pub(super) fn of(&self, view: usize, band: &Band) -> Targets<'_> {
         Targets {
             labels: &self.labels[view][band.index],
@@ -100,7 +100,7 @@ fn rows_of(level: &LevelField, view: usize, pixels: usize, first: i32) -> Result
     Ok(map.data.iter().map(|&l| if l < 0 { -1 } else { l + first }).collect())
 }
 
-/// What splats are seen with.
+/// Sums of codes and weights of the splats over all labelled pixels.
 pub(super) struct Lifted {
     /// [N, levels·d] blending-weighted sums of codes, `Σ_px w c`.
     pub(super) sums: Vec<f32>,
@@ -108,7 +108,7 @@ pub(super) struct Lifted {
     pub(super) weights: Vec<f32>,
 }
 
-/// Passes over all photos that lift, with the model's splats.
+/// Passes over all photos that lift codes onto the splats of the model.
 ///
 /// The gradient of `Σ_px F(px)·c(px)` by a splat's feature is `Σ_px w(px) c(px)`, so one backward
 /// pass per view with the codes as upstream gives the weighted sums, and with ones as upstream of a
@@ -120,12 +120,12 @@ pub(super) struct Lifting<'a> {
     pub(super) model: &'a Model,
     pub(super) raster: RasterOptions,
     pub(super) targets: &'a CodeTargets,
-    /// Asked before every pass whether to stop.
+    /// Checked for cancellation before every pass.
     pub(super) progress: &'a dyn Progress,
 }
 
 impl Lifting<'_> {
-    /// The sums and weights of all photos.
+    /// Computes the sums and weights of all photos.
     pub(super) fn sums(&mut self) -> Result<Lifted> {
         let (splats, levels) = (self.model.count(), self.targets.levels as usize);
         let mut lifted = Lifted {
@@ -133,25 +133,25 @@ impl Lifting<'_> {
             weights: vec![0.0; splats * levels],
         };
         for view in 0..self.cameras.len() {
-            self.back(view, Mode::Lift, &mut lifted.sums)?;
+            self.add_gradients(view, Mode::Lift, &mut lifted.sums)?;
             let frame = self.views.stage(view).raster.frame();
             for (row, by_level) in
                 lifted.weights.chunks_exact_mut(levels).zip(frame.colour_gradients(splats)?)
             {
                 row.iter_mut().zip(by_level).for_each(|(sum, w)| *sum += w);
             }
-            // Nothing is to be left of it for a loss that writes no colours.
+            // Cleared, because a loss without colours would leave these values.
             let colours = 3 * frame.bands.pixels();
             frame.planes_grad.write_at(0, &vec![0f32; colours])?;
         }
         Ok(lifted)
     }
 
-    /// Adds to `sums` what the backward pass of a view gives for an upstream.
-    pub(super) fn back(&mut self, view: usize, mode: Mode, sums: &mut [f32]) -> Result<()> {
+    /// Adds the gradients by the features of one view to `sums`.
+    pub(super) fn add_gradients(&mut self, view: usize, mode: Mode, sums: &mut [f32]) -> Result<()> {
         self.progress.check()?;
         self.views.set_camera(view, &self.cameras[view])?;
-        // The sums are gradients by what is rendered, whatever is stored.
+        // The sums are gradients by the rendered features.
         let raster = &RasterOptions { feature_mode: FeatureMode::Linear, ..self.raster };
         let (model, targets) = (self.model, self.targets);
         let stage = self.views.stage_mut(view);
@@ -180,27 +180,28 @@ impl Lifting<'_> {
 }
 
 impl Lifted {
-    /// Raw start features [N, levels·d]: the directions of the sums.
+    /// Raw start features [N, levels·d], in the directions of the sums.
     pub(super) fn features(&self, width: usize) -> Vec<f32> {
         let mut features = self.sums.clone();
-        // Its length is at most the weight, equal if all codes agree, and stands in for it.
+        // The length of a sum is at most the weight, and equal if all codes agree.
         features.chunks_exact_mut(width).filter(|f| length(f) <= MIN_WEIGHT).for_each(|f| f.fill(0.0));
         unit_start(features, width)
     }
 
-    /// [N] of one of `levels`: the length of the mean of the unit codes that a splat is seen with
-    /// (docs/internals/method.md#reliability), in steps of 1/255; 0 where it is not seen.
+    /// Reliability [N] of one of `levels`: the length of the mean of the unit codes of the pixels
+    /// of a splat (docs/internals/method.md#reliability), in steps of 1/255; 0 for splats without
+    /// pixels.
     pub(super) fn reliability(&self, level: usize, levels: usize, width: usize) -> Vec<f32> {
         let sums = self.sums.chunks_exact(width).skip(level).step_by(levels);
         let weights = self.weights.iter().skip(level).step_by(levels);
-        let one = |(sum, &weight): (&[f32], &f32)| {
+        let mean_length = |(sum, &weight): (&[f32], &f32)| {
             if weight > MIN_WEIGHT { (255.0 * (length(sum) / weight).min(1.0)).round() / 255.0 } else { 0.0 }
         };
-        sums.zip(weights).map(one).collect()
+        sums.zip(weights).map(mean_length).collect()
     }
 }
 
-/// Features of the length that training starts from; zeros stay.
+/// Scales features to the length that training starts from; zeros stay.
 pub(super) fn unit_start(mut features: Vec<f32>, width: usize) -> Vec<f32> {
     for feature in features.chunks_exact_mut(width) {
         let norm = length(feature);
@@ -211,6 +212,7 @@ pub(super) fn unit_start(mut features: Vec<f32>, width: usize) -> Vec<f32> {
     features
 }
 
+/// Length of a vector.
 fn length(v: &[f32]) -> f32 {
     v.iter().map(|v| v * v).sum::<f32>().sqrt()
 }
@@ -220,9 +222,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn reliability_is_how_far_the_codes_of_a_splat_agree() {
-        // Two levels of two numbers: one code throughout, two half and half; hardly seen, two
-        // opposite ones.
+    fn reliability_is_length_of_mean_code() {
+        // Two levels of two numbers: one code throughout, two codes in equal parts; hardly any
+        // weight, two opposite codes.
         let sums = vec![3.0, 0.0, 1.0, 1.0, 0.01, 0.0, 0.0, 0.0];
         let lifted = Lifted { sums, weights: vec![3.0, 2.0, 0.01, 4.0] };
         assert_eq!(lifted.reliability(0, 2, 2), [1.0, 0.0]);

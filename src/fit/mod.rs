@@ -1,7 +1,7 @@
 //! Training: losses, schedules, pruning, pose refinement.
 mod added;
 mod bounds;
-mod coarse;
+mod half_res;
 pub mod index_head;
 pub mod init;
 mod language;
@@ -22,7 +22,7 @@ mod views;
 pub use crate::preset::Preset;
 pub use added::new_surface;
 pub(crate) use added::train_on;
-pub(crate) use coarse::Photos;
+pub(crate) use half_res::Photos;
 pub(crate) use language::Run as LanguageRun;
 pub(crate) use language::train_language_of;
 pub use language::{LanguagePoint, TrainedLanguage, decode_accuracy, train_language};

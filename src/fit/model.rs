@@ -1,5 +1,5 @@
-//! Splat parameters in GPU memory with their gradients and optimiser state, moved together when
-//! splats come and go.
+//! Splat parameters in GPU memory with their gradients and optimiser state, which pruning moves
+//! together.
 use super::options::Rates;
 use crate::gpu::{self, Buffer, Device, Recorder};
 use crate::pass::adam::{Class, Moments, Schedule};
@@ -9,7 +9,7 @@ use crate::scene::Splats;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// The parameter classes, in the order of the schedule's rows.
+/// Parameter classes, in the order of the rows of the schedule.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ParameterClass {
     Means,
@@ -19,7 +19,7 @@ pub(super) enum ParameterClass {
     Sh,
 }
 
-/// Everything but the features.
+/// All classes but the features.
 pub(super) const GEOMETRY_AND_COLOUR: [ParameterClass; 5] = [
     ParameterClass::Means,
     ParameterClass::LogScales,
@@ -28,31 +28,31 @@ pub(super) const GEOMETRY_AND_COLOUR: [ParameterClass; 5] = [
     ParameterClass::Sh,
 ];
 
-/// Row of the schedule that the features use.
+/// Row of the features in the schedule.
 const FEATURE_ROW: usize = 5;
 
-/// All parameters of the splats, with room for nothing more: recordings are made again when splats
-/// come or go.
+/// All parameters of the splats, in buffers of exactly their number: recordings are made again when
+/// it changes.
 pub(super) struct Model {
     device: Device,
-    /// What the rasteriser reads.
+    /// Parameters that the rasteriser reads.
     pub(super) values: SplatBuffers,
-    /// What its backward pass writes.
+    /// Gradients that its backward pass writes.
     pub(super) gradients: SplatBuffers,
     moments: [Moments; 5],
     feature_moments: Moments,
     schedule: Schedule,
-    /// Steps that the moments have seen.
+    /// Number of steps in the moments.
     step: usize,
 }
 
-/// Everything of a [`Model`] that steps change.
+/// State of a [`Model`] that steps change, for checkpoints.
 #[derive(Serialize, Deserialize)]
 pub(super) struct State {
     pub(super) splats: Splats,
     features: Vec<f32>,
     feature_dim: usize,
-    /// Per class, and of the features.
+    /// Moments per class, then of the features.
     moments: Vec<Vec<f32>>,
     step: usize,
 }
@@ -66,7 +66,7 @@ impl Model {
         Ok(State { splats, features, feature_dim: self.values.feature_dim, moments, step: self.step })
     }
 
-    /// The model that a state was read from.
+    /// Restores a model from its state.
     pub(super) fn restored(device: &Device, state: &State) -> Result<Self> {
         let mut model = Model::new(device, &state.splats, state.feature_dim)?;
         model.values.features.write(&state.features)?;
@@ -106,7 +106,7 @@ impl Model {
         self.values.count
     }
 
-    /// Sets the rates of the next step; `extent` scales the means' rate.
+    /// Sets the rates of the next step; `extent` scales the rate of the means.
     pub(super) fn set_rates(
         &mut self,
         rates: &Rates,
@@ -126,8 +126,7 @@ impl Model {
         self.schedule.set(self.step, &rows)
     }
 
-    /// Records the Adam step of geometry, opacity and colour; void where the frame's `guard` says
-    /// so.
+    /// Records the Adam step of geometry, opacity and colour; void where `guard[1] ≠ 0`.
     pub(super) fn record_step(&self, rec: &mut Recorder, guard: &Buffer<u32>) {
         for kind in GEOMETRY_AND_COLOUR {
             let w = width(&self.values, kind);
@@ -142,7 +141,7 @@ impl Model {
         }
     }
 
-    /// Records the Adam step of the raw features, whose gradient stands in the feature gradients.
+    /// Records the Adam step of the raw features.
     pub(super) fn record_feature_step(&self, rec: &mut Recorder, guard: &Buffer<u32>) {
         let count = self.count() * self.values.feature_dim;
         let class = Class { slot: FEATURE_ROW as u32, count, stride: 1, head: 1 };
@@ -156,7 +155,7 @@ impl Model {
         );
     }
 
-    /// Fails if any step so far has met a gradient that is not finite.
+    /// Fails if a gradient of any step so far was not finite.
     pub(super) fn check(&self, iteration: usize) -> Result<()> {
         match self.schedule.faults()? {
             0 => Ok(()),
@@ -167,7 +166,8 @@ impl Model {
         }
     }
 
-    /// Keeps the given rows, optimiser state included; features start anew. Whether others went.
+    /// Keeps the given rows with their optimiser state; features and their moments are reset.
+    /// Returns whether rows were removed.
     pub(super) fn keep(&mut self, rows: &[u32]) -> Result<bool> {
         if rows.len() == self.count() {
             return Ok(false);
@@ -190,10 +190,13 @@ impl Model {
         Ok(true)
     }
 
-    /// Reads the splats back; an error if any value is not finite.
+    /// Copies the splats to the host.
+    ///
+    /// # Errors
+    /// Where a value is not finite.
     pub(super) fn splats(&self) -> Result<Splats> {
         let (splats, _) = self.values.download()?;
-        let bad = |(name, values): (&str, &[f32])| match not_finite(values) {
+        let fault = |(name, values): (&str, &[f32])| match not_finite(values) {
             0 => None,
             n => Some(format!("{n} {name}")),
         };
@@ -204,18 +207,18 @@ impl Model {
             ("opacities", &splats.opacity_logits),
             ("SH coefficients", &splats.sh),
         ];
-        let bad: Vec<String> = all.into_iter().filter_map(bad).collect();
-        if bad.is_empty() {
+        let faults: Vec<String> = all.into_iter().filter_map(fault).collect();
+        if faults.is_empty() {
             return Ok(splats);
         }
         Err(Error::work(format!(
             "training produced numbers that are not finite ({}); nothing was kept: the cameras or points may be degenerate",
-            bad.join(", ")
+            faults.join(", ")
         )))
     }
 }
 
-/// How many values are not finite.
+/// Number of values that are not finite.
 pub(super) fn not_finite(values: &[f32]) -> usize {
     values.iter().filter(|v| !v.is_finite()).count()
 }
@@ -230,6 +233,7 @@ fn width(splats: &SplatBuffers, kind: ParameterClass) -> usize {
     }
 }
 
+/// Buffer of a class.
 fn buffer(splats: &SplatBuffers, kind: ParameterClass) -> &Buffer<f32> {
     match kind {
         ParameterClass::Means => &splats.means,

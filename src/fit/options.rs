@@ -1,12 +1,12 @@
-//! What the training stages can be told, and the presets.
+//! Options of the training stages, and their presets.
 use super::pose::PoseOptions;
 use super::schedule::Exponential;
 use crate::preset::Preset;
 
-/// How splats start (docs/internals/method.md#splats-from-points).
+/// Initialisation of splats (docs/internals/method.md#splats-from-points).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct InitOptions {
-    /// At most this many splats; more points are thinned to an even density by voxels.
+    /// Most splats; more points are thinned to an even density by voxels.
     pub max_points: usize,
     /// Opacity of a new splat, in (0, 1).
     pub opacity: f32,
@@ -35,7 +35,7 @@ pub struct Rates {
 }
 
 impl Rates {
-    /// Nothing moves.
+    /// Rates of zero.
     pub const STILL: Rates = Rates {
         means: Exponential { start: 0.0, end: 0.0, steps: 1 },
         log_scales: 0.0,
@@ -53,14 +53,14 @@ pub struct RgbOptions {
     pub iterations: usize,
     /// Seeds the view order and thinning.
     pub seed: u64,
-    /// Start of the splats.
+    /// Initialisation of the splats.
     pub init: InitOptions,
-    /// How far surfaces are continued beyond the photo borders, in units of the longer image side
-    /// (needs depth maps); 0 = nothing is continued, behind depth edges neither.
+    /// Reach of continued surfaces beyond the photo borders, in units of the longer image side
+    /// (needs depth maps); 0 = no surface is continued, also behind depth edges.
     pub margin: f64,
     /// Learning rates.
     pub rates: Rates,
-    /// Share of the steps, from the first on, that see the photos at half their size.
+    /// Share of the steps, from the first on, with the photos at half their resolution.
     pub coarse: f64,
     /// Weight of mean |render − photo|.
     pub l1_weight: f64,
@@ -69,22 +69,22 @@ pub struct RgbOptions {
     /// Weight of the relative depth difference to the stereo depth where that is confident; 0 =
     /// off.
     pub depth_weight: f64,
-    /// Stereo depth counts only where its confidence is at least this.
+    /// Least confidence of stereo depth that is used.
     pub min_confidence: f32,
     /// Weight of `mean max(0, s_max/s_min − 8)`, against needles; 0 = off.
     pub ratio_weight: f64,
-    /// No splat before everything that a photo shows, none larger than a share of its distance to
-    /// the cameras: held at the start, when pruning, and in the end.
+    /// Whether splats are kept behind the nearest depths of the photos and below a share of their
+    /// distance to the cameras in size; applied at the start, when pruning, and at the end.
     pub bounded: bool,
-    /// Drop splats with a lower opacity …
+    /// Opacity below which splats are pruned.
     pub prune_opacity: f32,
-    /// … every so many steps (0 = never) …
+    /// Interval of pruning, steps; 0 = never.
     pub prune_every: usize,
-    /// … from this step on.
+    /// First step of pruning.
     pub prune_from: usize,
-    /// Camera refinement, if at all.
+    /// Camera refinement; `None` = off.
     pub poses: Option<PoseOptions>,
-    /// A point of the loss curve every so many steps.
+    /// Interval of points of the loss curve, steps.
     pub report_every: usize,
 }
 
@@ -93,22 +93,22 @@ impl RgbOptions {
     pub fn preset(preset: Preset) -> Self {
         match preset {
             Preset::Paper => Self::paper(),
-            // Fewer steps take proportionally longer ones: with Adam the distance a parameter can
-            // travel is about rate × steps. Rates stay below the point where the loss oscillates
-            // (means: a tenth of a pixel a step).
+            // Fewer steps need proportionally higher rates: with Adam a parameter moves by at most
+            // about rate × steps. Rates stay below the point where the loss oscillates (means: a
+            // tenth of a pixel per step).
             Preset::Draft => Self::draft(),
             Preset::Default => Self::short(),
         }
     }
 
-    /// No more than `most` splats in the end; `planned` is how many there would be with those
-    /// beyond the photos' borders.
+    /// Limits the final number of splats to `most`; `planned` is the number without a limit,
+    /// including splats beyond the photo borders.
     pub fn limit_splats(&mut self, most: usize, planned: usize) {
         let beyond = planned.saturating_sub(self.init.max_points);
         self.init.max_points = self.init.max_points.min(most.saturating_sub(beyond));
     }
 
-    /// The same options for another number of steps; schedules end with the run.
+    /// These options for another number of steps; schedules end with the run.
     pub fn with_iterations(mut self, iterations: usize) -> Self {
         self.iterations = iterations;
         if self.rates.means.steps < 30_000 {
@@ -121,27 +121,27 @@ impl RgbOptions {
         self
     }
 
-    /// The same options for a scene of `known` photos that goes on with `new` more: each may bring
-    /// its share of the splats.
+    /// These options for continuing a scene of `known` photos with `new` more: each new photo may
+    /// add its share of the splats.
     pub fn for_continuation(self, known: usize, new: usize) -> Self {
-        // Steps at half size, 0.6 of a run, would undo what the scene shows already: they are left
-        // out, and of the others there are a few more, since new splats have seen none of them. Of
-        // many photos each is seen as often as in a run with sixteen.
+        // Steps at half resolution, 0.6 of a run, would undo details of the scene and are omitted.
+        // There are a few more of the other steps, because new splats are untrained. With many
+        // photos, each is used as often as in a run with sixteen.
         let steps = self.iterations.div_ceil(2).max(self.iterations * (known + new) / 16);
         let mut options = RgbOptions { coarse: 0.0, ..self.with_iterations(steps) };
         options.init.max_points = (options.init.max_points * new).div_ceil((known + new).max(1));
         options
     }
 
-    /// Most steps at half the photos' size. A thousand steps learn a few photos by heart: 0.9 dB
-    /// more on them, 0.3 less on views between them
+    /// Options of the default preset, with most steps at half resolution. A thousand steps overfit
+    /// a few photos: 0.9 dB more on them, 0.3 less on views between them
     /// (docs/internals/experiments.md#how-long-to-train).
     fn short() -> Self {
         RgbOptions { coarse: 0.6, ..Self::scaled(300, 2.0) }
     }
 
-    /// Fewer splats: on breakfast two fifths less time and 0.4 dB more on held-out views, 1.2 dB
-    /// less on the photos themselves.
+    /// Options of the draft preset, with fewer splats: on breakfast two fifths less time and 0.4 dB
+    /// more on held-out views, 1.2 dB less on the photos themselves.
     fn draft() -> Self {
         let mut options = Self::short();
         options.init.max_points = 130_000;
@@ -152,10 +152,10 @@ impl RgbOptions {
         let paper = Self::paper();
         RgbOptions {
             iterations,
-            // Stereo points are dense and already have the right colour, so splats start nearly
-            // opaque: from 0.1 the first hundred steps would only build up opacity.
+            // Stereo points are dense and have the right colour, so splats start nearly opaque:
+            // from an opacity of 0.1, the first hundred steps would only raise it.
             init: InitOptions { max_points: 200_000, opacity: 0.6, footprint: 0.7, neighbours: 1.0 },
-            // Held-out breakfast views show up to 14 % of pixels that no photo covers, all within
+            // No photo covers up to 14 % of the pixels of held-out breakfast views; all are within
             // this reach.
             margin: 0.3,
             rates: Rates {
@@ -213,17 +213,15 @@ impl RgbOptions {
     }
 }
 
-/// What features start from.
+/// Initialisation of features.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Start {
     /// Zero, as the paper.
     Zero,
-    /// The mean of the codes that a splat is seen with, weighted by how much it is blended into
-    /// their pixels.
+    /// Mean of the codes of the pixels of a splat, weighted by its blending weights.
     Lifted,
-    /// The features whose blend is nearest to the codes of all labelled pixels, in the sense of
-    /// least squares.
+    /// Linear least squares of the blended features against the codes of all labelled pixels.
     LeastSquares,
 }
 
@@ -241,18 +239,18 @@ pub struct LanguageOptions {
     pub rates: Rates,
     /// Learning rate of the features.
     pub feature_rate: f64,
-    /// ε of `f̂ = f/(‖f‖+ε)` per level (docs/internals/method.md#feature-gauge); only the ratio of
-    /// ε and learning rate matters when features start at zero.
+    /// ε of `f̂ = f/(‖f‖+ε)` per level (docs/internals/method.md#feature-gauge); for features that
+    /// start at zero, only the ratio of ε and learning rate matters.
     pub epsilon: f32,
-    /// What the features start from.
+    /// Initialisation of the features.
     pub start: Start,
-    /// Train every level on its own copy of the splats, as the paper; otherwise all levels share
-    /// one geometry.
+    /// Whether every level has its own copy of the splats, as in the paper; otherwise all levels
+    /// share one geometry.
     pub per_level: bool,
-    /// Keep geometry, opacity and colour fixed: only the features move.
+    /// Whether geometry, opacity and colour stay fixed and only the features are trained.
     pub detach_geometry: bool,
-    /// Measure the decode accuracy every so many steps and after the last one (0 = never), and stop
-    /// when it gains less than 0.1 % in two measurements.
+    /// Interval of measurements of the decode accuracy, steps; 0 = never. It is also measured after
+    /// the last step. Training stops when it gains less than 0.1 % in two measurements.
     pub check_every: usize,
 }
 
@@ -260,8 +258,8 @@ impl LanguageOptions {
     /// The options of a preset.
     pub fn preset(preset: Preset) -> Self {
         let iterations = match preset {
-            // Lifted features start near the end: three times as many steps decode as many pixels
-            // and find the same objects.
+            // Lifted features start near convergence: three times as many steps decode as many
+            // pixels and find the same objects.
             Preset::Draft => 10,
             Preset::Default => 60,
             Preset::Paper => 1000,
@@ -279,8 +277,8 @@ impl LanguageOptions {
                 sh_dc: 1e-4,
                 sh_rest: 1e-4 / 20.0,
             },
-            // From zero: the paper's dynamics (7e-9 at ε = 1e-9) scaled to numbers f32 holds. After
-            // lifting: 2.5e-3.
+            // From zero: the dynamics of the paper (7e-9 at ε = 1e-9) scaled to the range of f32.
+            // After lifting: 2.5e-3.
             feature_rate: if paper { 7e-3 } else { 2.5e-3 },
             epsilon: 1e-3,
             start: if paper { Start::Zero } else { Start::Lifted },
@@ -297,7 +295,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn with_another_number_of_steps_rates_fall_until_the_last_of_them() {
+    fn with_iterations_stretches_the_schedules() {
         for steps in [30, 3000] {
             let options = RgbOptions::preset(Preset::Draft).with_iterations(steps);
             for rate in [Some(options.rates.means), options.poses.map(|p| p.rate)].into_iter().flatten() {
@@ -305,7 +303,7 @@ mod tests {
                 assert!((share(steps) - 1.0).abs() < 1e-9 && share(steps - 1) > 1.0001, "{steps}: {rate:?}");
             }
         }
-        // That of the paper is longer than its runs (docs/internals/method.md#schedules).
+        // The schedule of the paper is longer than its runs (docs/internals/method.md#schedules).
         let paper = RgbOptions::preset(Preset::Paper);
         assert_eq!(paper.clone().with_iterations(100).rates.means, paper.rates.means);
     }

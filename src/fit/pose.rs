@@ -5,8 +5,8 @@ use crate::scene::Pose;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-/// Largest rotation (rad) and translation (in units of the scene scale) of one step: a single bad
-/// gradient must not throw a camera out of the scene.
+/// Largest rotation (rad) and translation (in units of the scene scale) of one step, so that a
+/// single bad gradient cannot move a camera out of the scene.
 const MAX_STEP: f64 = 1e-3;
 
 /// Adam state of one camera.
@@ -39,10 +39,10 @@ impl PoseAdam {
     }
 }
 
-/// When and how fast poses move.
+/// Schedule of pose refinement.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseOptions {
-    /// First step (0-based) that moves cameras: before, the splats are still settling.
+    /// First step (0-based) that moves cameras, after the splats have settled.
     pub start: usize,
     /// Radians per step; translations use the same number times the scene scale.
     pub rate: Exponential,
@@ -53,7 +53,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn descends_a_quadratic_in_the_tangent_space() {
+    fn pose_adam_minimises_a_quadratic() {
         let target = Pose::exp(DVec3::new(0.02, -0.01, 0.03), DVec3::new(0.008, -0.004, 0.006));
         let mut pose = Pose::IDENTITY;
         let mut adam = PoseAdam::default();
@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn non_finite_gradients_leave_the_pose_alone() {
+    fn pose_adam_ignores_non_finite_gradients() {
         let pose = Pose::exp(DVec3::X, DVec3::Y * 0.1);
         assert_eq!(PoseAdam::default().update(&pose, [f64::NAN; 6], 1e-3, 1.0), pose);
     }

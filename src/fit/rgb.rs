@@ -1,7 +1,7 @@
-//! The RGB stage: splats from points, fitted to the photos, cameras refined on the way
+//! RGB stage: fits splats, initialised from points, to the photos and refines the cameras
 //! (docs/internals/method.md#splats).
 use super::bounds::Bounds;
-use super::coarse::{HalfSizePhotos, Photos};
+use super::half_res::{HalfResPhotos, Photos};
 use super::init::splats_from_points;
 use super::model::Model;
 use super::options::RgbOptions;
@@ -24,8 +24,8 @@ use std::time::Instant;
 #[cfg(test)]
 mod tests;
 
-/// Photos of 8 bits cannot show more than their rounding noise, 10·log10(12·255²) = 58.9 dB: a
-/// render that happens to match exactly must not outweigh all other views.
+/// Upper bound of PSNR, dB: above the rounding noise of 8-bit photos, 10·log10(12·255²) = 58.9 dB,
+/// so that a render that happens to match exactly does not outweigh all other views.
 pub(crate) const MOST_PSNR: f64 = 60.0;
 /// Scale ratios above this are penalised (docs/internals/method.md#regularisers).
 const RATIO_LIMIT: f32 = 8.0;
@@ -39,19 +39,18 @@ pub struct CurvePoint {
     pub loss: f64,
     /// Mean SSIM over the same steps.
     pub ssim: f64,
-    /// Mean over the views of the PSNR when each was last looked at, dB. One view is looked at per
-    /// point, which costs a copy of its render; until every view had its turn the mean is over
-    /// those that had.
+    /// Mean over the views of their last measured PSNR, dB. Each point measures one view, which
+    /// costs a copy of its render; views without a measurement are not in the mean.
     pub psnr: f64,
     /// Number of splats.
     pub splats: usize,
 }
 
-/// What happened during a fit.
+/// Statistics of a fit.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct FitStats {
-    /// The loss over time.
+    /// Training curve.
     pub curve: Vec<CurvePoint>,
     /// PSNR per training view with the returned cameras, dB.
     pub psnr: Vec<f64>,
@@ -59,7 +58,7 @@ pub struct FitStats {
     pub splats: [usize; 2],
     /// Whether the refined cameras were kept.
     pub poses_refined: bool,
-    /// What photos say of colours that depend on the direction; empty where nobody asked.
+    /// Evidence of the photos for view-dependent colour; empty where it was not fitted.
     #[serde(default)]
     pub view_dependence: ViewDependence,
     /// Wall-clock time, seconds.
@@ -73,7 +72,7 @@ impl FitStats {
     }
 }
 
-/// The result of the RGB stage.
+/// Result of the RGB stage.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[non_exhaustive]
 pub struct Trained {
@@ -81,7 +80,7 @@ pub struct Trained {
     pub splats: Splats,
     /// Refined cameras; the first as given.
     pub cameras: Vec<Camera>,
-    /// How it went.
+    /// Statistics.
     pub stats: FitStats,
 }
 
@@ -99,7 +98,7 @@ pub fn train_rgb(
     train_photos(device, Photos { images, cameras, depths, coverage: &[] }, points, options, progress)
 }
 
-/// [`train_rgb`] of photos of which not all pixels may count.
+/// [`train_rgb`] with the coverage of the photos.
 pub(crate) fn train_photos(
     device: &Device,
     photos: Photos,
@@ -109,19 +108,19 @@ pub(crate) fn train_photos(
 ) -> Result<Trained> {
     let Photos { images, cameras, depths, .. } = photos;
     let mut start = splats_from_points(points, &options.init, options.seed)?;
-    // Where a background is empty, surfaces end at the silhouette.
+    // With an empty background, surfaces end at the silhouette.
     if let Some(depths) = depths.filter(|_| options.margin > 0.0 && !photos.show_emptiness()) {
         let (reach, confidence) = (options.margin, options.min_confidence);
         start.append(unseen_splats(images, cameras, depths, reach, confidence, options.seed));
     }
     if options.bounded {
-        start = Bounds::new(cameras, &points.positions).hold(start);
+        start = Bounds::new(cameras, &points.positions).clamp_to_bounds(start);
     }
     let scale = SceneScale::of(cameras, points);
     fit_photos(device, photos, start, scale, options, progress)
 }
 
-/// [`train_rgb`] from given splats instead of points, with the SH degree that they have.
+/// [`train_rgb`] from given splats instead of points, with their SH degree.
 pub fn fit_rgb(
     device: &Device,
     images: &[RgbImage],
@@ -136,7 +135,7 @@ pub fn fit_rgb(
     fit_photos(device, photos, start, scale, options, progress)
 }
 
-/// [`fit_rgb`] of photos of which not all pixels may count.
+/// [`fit_rgb`] with the coverage of the photos.
 pub(crate) fn fit_photos(
     device: &Device,
     photos: Photos,
@@ -163,12 +162,12 @@ pub(crate) fn fit_photos(
 }
 
 impl Photos<'_> {
-    /// Whether a background that is empty is shown.
+    /// Whether a photo has an empty background.
     pub(super) fn show_emptiness(&self) -> bool {
         self.coverage.iter().flatten().any(|c| c.outside == Outside::Empty)
     }
 
-    /// PSNR of a render of a photo over the pixels that count, dB.
+    /// PSNR of a render of a photo over its used pixels, dB.
     pub(super) fn psnr(&self, photo: usize, rendered: &RgbImage) -> f64 {
         let weights = self.coverage.get(photo).and_then(Option::as_ref).map(Coverage::weights);
         let counts = |i: usize| weights.as_ref().is_none_or(|w| w.data[i] > 0.0);
@@ -176,8 +175,8 @@ impl Photos<'_> {
     }
 }
 
-/// Depth and the confidence it needs, if it counts at all.
-fn used<'d>(depths: Option<&'d [DepthMap]>, options: &RgbOptions) -> Option<(&'d [DepthMap], f32)> {
+/// Depth maps with their least confidence, if the depth loss is on.
+fn depth_inputs<'d>(depths: Option<&'d [DepthMap]>, options: &RgbOptions) -> Option<(&'d [DepthMap], f32)> {
     depths.filter(|_| options.depth_weight > 0.0).map(|d| (d, options.min_confidence))
 }
 
@@ -188,19 +187,19 @@ pub(crate) struct Run<'a> {
     scale: SceneScale,
     photos: Photos<'a>,
     bounds: Option<Bounds>,
-    /// What the first steps see instead of the photos.
-    half: Option<HalfSizePhotos>,
+    /// Photos of the first steps.
+    half_res: Option<HalfResPhotos>,
     poses: Vec<PoseAdam>,
     /// Losses since the last report.
     recent: Vec<ImageLoss>,
     /// The view of the last step.
     last: usize,
-    /// Per view its last PSNR, dB.
+    /// Last measured PSNR per view, dB.
     psnr: Vec<Option<f64>>,
     curve: Vec<CurvePoint>,
 }
 
-/// What steps change beside the model.
+/// State of the stage besides the model, for checkpoints.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct StageState {
     poses: Vec<PoseAdam>,
@@ -218,25 +217,25 @@ impl<'a> Run<'a> {
         scale: SceneScale,
         options: &'a RgbOptions,
     ) -> Result<Self> {
-        let half = (coarse_steps(options) > 0).then(|| HalfSizePhotos::of(&photos));
-        let seen = half.as_ref().map_or(photos, HalfSizePhotos::photos);
+        let half_res = (half_res_steps(options) > 0).then(|| HalfResPhotos::of(&photos));
+        let first = half_res.as_ref().map_or(photos, HalfResPhotos::photos);
         let raster = RasterOptions {
             sh_degree: start.sh_degree,
             feature_mode: FeatureMode::Linear,
             features_move_geometry: true,
         };
-        let depths = used(seen.depths, options);
-        let Photos { images, cameras, coverage, .. } = seen;
+        let depths = depth_inputs(first.depths, options);
+        let Photos { images, cameras, coverage, .. } = first;
         let views = Views::new(device, images, cameras, depths, coverage, start.len(), 0, scale.near())?;
         let model = Model::new(device, start, 0)?;
-        let trainer = Trainer::new(device, raster, model, views, seen.cameras, options.seed);
+        let trainer = Trainer::new(device, raster, model, views, first.cameras, options.seed);
         Ok(Run {
             trainer,
             options,
             scale,
             photos,
             bounds: options.bounded.then(|| Bounds::new(photos.cameras, &start.means)),
-            half,
+            half_res,
             poses: vec![PoseAdam::default(); photos.cameras.len()],
             recent: Vec::new(),
             last: 0,
@@ -245,13 +244,13 @@ impl<'a> Run<'a> {
         })
     }
 
-    /// Goes on with the photos at their full size; the poses found so far stay.
-    fn leave_half_size(&mut self) -> Result<()> {
-        if self.half.take().is_none() {
+    /// Continues with the photos at full resolution; the refined poses stay.
+    fn leave_half_res(&mut self) -> Result<()> {
+        if self.half_res.take().is_none() {
             return Ok(());
         }
         let (t, Photos { images, cameras, depths, coverage }) = (&mut self.trainer, self.photos);
-        let (depths, near) = (used(depths, self.options), self.scale.near());
+        let (depths, near) = (depth_inputs(depths, self.options), self.scale.near());
         t.views = Views::new(&t.device, images, cameras, depths, coverage, t.model.count(), 0, near)?;
         for (own, camera) in t.cameras.iter_mut().zip(cameras) {
             *own = Camera { pose: own.pose, ..camera.clone() };
@@ -260,7 +259,7 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// Pose refinement; camera 0 holds the world frame.
+    /// Refines a pose; camera 0 stays, because it defines the world frame.
     fn move_camera(&mut self, view: usize, iteration: usize) -> Result<()> {
         let Some(poses) = self.options.poses.filter(|p| view > 0 && iteration >= p.start) else {
             return Ok(());
@@ -273,16 +272,16 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
-    /// A point of the loss curve, and with it the check for broken numbers.
+    /// Measures a point of the loss curve and checks for gradients that are not finite.
     fn measure(&mut self, step: usize) -> Result<CurvePoint> {
         let t = &mut self.trainer;
         t.model.check(step)?;
-        let shown = match t.views.shown(self.last)? {
-            Some(shown) => shown,
+        let rendered = match t.views.last_render(self.last)? {
+            Some(rendered) => rendered,
             None => t.views.render(self.last, &t.cameras[self.last], &t.model, &t.raster)?,
         };
-        let seen = self.half.as_ref().map_or(self.photos, HalfSizePhotos::photos);
-        self.psnr[self.last] = Some(seen.psnr(self.last, &shown));
+        let photos = self.half_res.as_ref().map_or(self.photos, HalfResPhotos::photos);
+        self.psnr[self.last] = Some(photos.psnr(self.last, &rendered));
         let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
         let n = self.recent.len().max(1) as f64;
         let total = |l: &ImageLoss| l.total(self.options.l1_weight, self.options.dssim_weight);
@@ -298,7 +297,7 @@ impl<'a> Run<'a> {
         Ok(point)
     }
 
-    /// Drops what has faded away and holds the rest in its bounds.
+    /// Removes faint splats and clamps the others to the bounds.
     fn prune(&mut self, step: usize) -> Result<()> {
         let every = self.options.prune_every;
         if every == 0 || step < self.options.prune_from || !step.is_multiple_of(every) {
@@ -315,32 +314,33 @@ impl<'a> Run<'a> {
         if model.keep(&rows)? {
             self.trainer.forget_recordings();
         }
-        self.hold()
+        self.clamp_to_bounds()
     }
 
-    /// Keeps splats from standing before a photo.
-    fn hold(&mut self) -> Result<()> {
+    /// Clamps the splats to the bounds, if there are any.
+    fn clamp_to_bounds(&mut self) -> Result<()> {
         if let Some(bounds) = &self.bounds
-            && bounds.hold_model(&mut self.trainer.model)?
+            && bounds.clamp_model_to_bounds(&mut self.trainer.model)?
         {
             self.trainer.forget_recordings();
         }
         Ok(())
     }
 
-    /// Reads everything back and keeps the refined cameras only if they explain the photos better.
+    /// Copies the results to the host and keeps the refined cameras only if they explain the photos
+    /// better.
     fn finish(&mut self) -> Result<(Splats, Vec<Camera>, Vec<f64>, bool)> {
-        self.leave_half_size()?;
-        self.hold()?;
+        self.leave_half_res()?;
+        self.clamp_to_bounds()?;
         let (t, photos) = (&mut self.trainer, self.photos);
         let initial = photos.cameras;
         let splats = t.model.splats()?;
         let mut score = |cameras: &[Camera]| -> Result<Vec<f64>> {
-            let one = |i: usize| {
+            let psnr = |i: usize| {
                 let rendered = t.views.render(i, &cameras[i], &t.model, &t.raster)?;
                 Ok(photos.psnr(i, &rendered))
             };
-            (0..photos.images.len()).map(one).collect()
+            (0..photos.images.len()).map(psnr).collect()
         };
         let refined = score(&t.cameras)?;
         if self.options.poses.is_none() {
@@ -367,8 +367,8 @@ impl Training for Run<'_> {
     }
 
     fn schedule(&mut self, iteration: usize) -> Result<()> {
-        if iteration >= coarse_steps(self.options) {
-            self.leave_half_size()?;
+        if iteration >= half_res_steps(self.options) {
+            self.leave_half_res()?;
         }
         self.trainer.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)
     }
@@ -385,14 +385,14 @@ impl Training for Run<'_> {
             let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
             let gradient = &frame.planes_grad;
             stage.loss.record(&mut rec, &band, &frame.planes, target, gradient, item.covered, weights, sums);
-            // Without depth of its own, a view clears what another of its size may have left.
+            // A view without depth clears the gradients of another view of its size.
             let (reference, pixels) = match &item.depth {
                 Some((references, count)) => (Some(&references[band.index]), *count as f64),
                 None => (None, 1.0),
             };
             regularise::record_depth(&mut rec, frame, reference, self.options.depth_weight / pixels);
             if let Some(alpha) = &item.alpha {
-                // As one more channel of the L1 loss.
+                // Weighted as one more channel of the L1 loss.
                 let weight = self.options.l1_weight / f64::from(frame.width * frame.height);
                 regularise::record_alpha(&mut rec, frame, &alpha[band.index], weight);
             }
@@ -423,15 +423,15 @@ impl Training for Run<'_> {
     }
 
     fn review(&mut self, step: usize) -> Result<StepReport> {
-        let mut review = StepReport::default();
+        let mut report = StepReport::default();
         let every = self.options.report_every.max(1);
         if step > 0 && (step.is_multiple_of(every) || step == self.options.iterations) {
             let CurvePoint { loss, ssim, psnr, splats, .. } = self.measure(step)?;
-            review.note = Some(format!("loss {loss:.4}, PSNR {psnr:.1}, {splats} splats"));
-            review.figures = vec![("loss", loss), ("ssim", ssim), ("psnr", psnr), ("splats", splats as f64)];
+            report.note = Some(format!("loss {loss:.4}, PSNR {psnr:.1}, {splats} splats"));
+            report.figures = vec![("loss", loss), ("ssim", ssim), ("psnr", psnr), ("splats", splats as f64)];
         }
         self.prune(step)?;
-        Ok(review)
+        Ok(report)
     }
 
     fn stage_state(&self) -> StageState {
@@ -451,7 +451,7 @@ impl Training for Run<'_> {
     }
 }
 
-/// Steps at half the photos' size, at the beginning.
-fn coarse_steps(options: &RgbOptions) -> usize {
+/// Number of first steps with the photos at half resolution.
+fn half_res_steps(options: &RgbOptions) -> usize {
     (options.coarse * options.iterations as f64) as usize
 }

@@ -3,21 +3,20 @@ use crate::math::median;
 use crate::scene::{Camera, PointCloud};
 use glam::DVec3;
 
-/// The lengths that schedules are relative to, world units.
+/// Lengths that schedules are relative to, world units.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SceneScale {
-    /// Multiplies position rates: the camera radius of Kerbl et al. 2023, but at least a quarter of
-    /// the median depth, since few photos taken close together say little about the size of the
-    /// scene.
+    /// Factor of the position rates: the camera radius of Kerbl et al. 2023, but at least a quarter
+    /// of the median depth, since a few close cameras are no measure of the size of the scene.
     pub extent: f64,
     /// Median camera z of the points over all cameras.
     pub median_depth: f64,
 }
 
 impl SceneScale {
-    /// Measures a scene; points behind a camera do not count for it.
+    /// Measures a scene; a camera ignores points behind it.
     pub fn measure(cameras: &[Camera], points: &[[f32; 3]]) -> Self {
-        // 20 000 samples pin the median to a fraction of a percent.
+        // With 20 000 samples the median is exact to a fraction of a percent.
         let stride = points.len().div_ceil(20_000).max(1);
         let mut depths: Vec<f64> = Vec::new();
         for camera in cameras {
@@ -35,13 +34,11 @@ impl SceneScale {
         SceneScale { extent: radius.max(0.25 * median_depth), median_depth }
     }
 
-    /// Splats nearer to the camera than this are not drawn: a hundredth of the median depth.
+    /// Near plane: a hundredth of the median depth.
     pub fn near(&self) -> f64 {
         0.01 * self.median_depth
     }
-}
 
-impl SceneScale {
     /// [`SceneScale::measure`] for a point cloud.
     pub fn of(cameras: &[Camera], points: &PointCloud) -> Self {
         Self::measure(cameras, &points.positions)
@@ -54,7 +51,7 @@ mod tests {
     use crate::scene::Pose;
 
     #[test]
-    fn extent_follows_cameras_or_depth_whichever_is_larger() {
+    fn extent_follows_radius_or_depth() {
         let camera = |x: f64| Camera {
             name: String::new(),
             width: 8,

@@ -1,4 +1,4 @@
-//! Learning-rate schedules and the order in which views are seen.
+//! Learning-rate schedules and the order of the views.
 use crate::math::Random;
 use serde::{Deserialize, Serialize};
 
@@ -15,10 +15,11 @@ pub struct Exponential {
 }
 
 impl Exponential {
-    /// A rate that does not change.
+    /// A constant rate.
     pub fn constant(rate: f64) -> Self {
         Exponential { start: rate, end: rate, steps: 1 }
     }
+
     /// Rate at a 0-based step.
     pub fn at(&self, step: usize) -> f64 {
         if self.start <= 0.0 {
@@ -38,11 +39,12 @@ pub struct ViewOrder {
 }
 
 impl ViewOrder {
-    /// An order over `0..views` for a seed.
+    /// Order over `0..views` for a seed.
     pub fn new(views: usize, seed: u64) -> Self {
         ViewOrder { random: Random::new(seed), views, left: Vec::new() }
     }
-    /// The next view.
+
+    /// Draws the next view.
     pub fn draw(&mut self) -> usize {
         if self.left.is_empty() {
             self.left = (0..self.views).collect();
@@ -57,18 +59,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exponential_meets_its_ends_and_the_published_midpoint() {
+    fn exponential_matches_published_rates() {
         let rate = Exponential { start: 1.6e-4, end: 1.6e-6, steps: 30000 };
         assert!((rate.at(0) - 1.6e-4).abs() < 1e-12 && (rate.at(30000) - 1.6e-6).abs() < 1e-14);
         assert!((rate.at(15000) - 1.6e-5).abs() < 1e-12);
-        // docs/internals/method.md#schedules: the preset `paper` hardly lowers the rate within its
-        // 1000 steps.
+        // The preset `paper` hardly lowers the rate within its 1000 steps
+        // (docs/internals/method.md#schedules).
         assert!((rate.at(1000) / 1.6e-4 - 0.8577).abs() < 1e-4, "factor .86 within 1000");
         assert_eq!(Exponential::constant(0.0).at(3), 0.0);
     }
 
     #[test]
-    fn every_round_sees_every_view_once() {
+    fn view_order_draws_each_view_once() {
         let mut order = ViewOrder::new(4, 7);
         for _ in 0..10 {
             let mut round: Vec<usize> = (0..4).map(|_| order.draw()).collect();

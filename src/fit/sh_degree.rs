@@ -1,23 +1,23 @@
-//! What photos say of the SH degree of a scene.
+//! Choice of the SH degree of a scene by cross-validation.
 use serde::{Deserialize, Serialize};
 
-/// What photos left out must gain for a degree to be worth its numbers, dB: a degree multiplies the
-/// colours of a file by 4 to 16, and less than this nobody sees.
+/// Least mean gain of left-out photos that supports a degree, dB: a degree multiplies the colours
+/// of a file by 4 to 16, and a smaller gain is invisible.
 const LEAST_GAIN: f64 = 0.1;
 
-/// What leaving photos out said of one degree.
+/// Result of the cross-validation of one degree.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DegreeTrial {
     /// SH degree.
     pub degree: u32,
-    /// Mean over the photos of what a photo left out gains by the degree, dB.
+    /// Mean gain in PSNR of left-out photos, dB.
     pub gain: f64,
     /// Standard error of that mean, dB.
     pub error: f64,
 }
 
 impl DegreeTrial {
-    /// From the PSNR of every photo with and without it, dB; two photos at least.
+    /// Trial from the PSNR of every photo with and without the degree, dB; two photos at least.
     pub(super) fn of(degree: u32, with: &[f64], without: &[f64]) -> Self {
         let n = with.len() as f64;
         let gains: Vec<f64> = with.iter().zip(without).map(|(a, b)| a - b).collect();
@@ -26,19 +26,19 @@ impl DegreeTrial {
         DegreeTrial { degree, gain, error: (variance / n).sqrt() }
     }
 
-    /// Whether the gain is worth having and more than chance, at two standard errors.
+    /// Whether the gain is large enough and significant, at two standard errors.
     pub fn supported(&self) -> bool {
         self.gain > LEAST_GAIN && self.gain > 2.0 * self.error
     }
 }
 
-/// How the SH degree of a scene was found.
+/// SH degree of a scene, with the trials that it was chosen by.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ViewDependence {
     /// SH degree of the scene.
     pub degree: u32,
-    /// The degrees that were tried, the highest first; none where a degree was given, the photos
-    /// are too few, or show the same points equally bright.
+    /// Degrees tried, the highest first; none where the degree was given, the photos are too few,
+    /// or they show the same points equally bright.
     pub trials: Vec<DegreeTrial>,
 }
 
@@ -47,7 +47,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_degree_needs_a_gain_that_is_worth_it_and_no_chance() {
+    fn degree_needs_large_and_significant_gain() {
         let trial = |gains: &[f64]| DegreeTrial::of(2, gains, &vec![0.0; gains.len()]);
         assert!(trial(&[0.5, 0.7, 0.6, 0.4]).supported());
         assert!(!trial(&[0.04, 0.05, 0.06, 0.05]).supported(), "nobody sees it");

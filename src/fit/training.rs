@@ -1,4 +1,4 @@
-//! What both training stages share: a step on the next view, repeated when its tile lists overflow;
+//! Training loop of both stages: a step on the next view, repeated when its tile lists overflow;
 //! reports; checkpoints.
 use super::model::{self, Model};
 use super::schedule::ViewOrder;
@@ -12,7 +12,7 @@ use crate::{Error, Result};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-/// What is trained, and on what.
+/// Model, views and cameras of a training.
 pub(crate) struct Trainer {
     pub(super) device: Device,
     pub(super) raster: RasterOptions,
@@ -20,30 +20,29 @@ pub(crate) struct Trainer {
     pub(super) views: Views,
     pub(super) cameras: Vec<Camera>,
     order: ViewOrder,
-    /// One recorded step per view; empty after anything that it binds has changed.
+    /// One recorded step per view; `None` after a change of its buffers.
     programs: Vec<Option<Program>>,
-    /// Index among the models that a stage trains one after the other.
+    /// Index of the model among those that a stage trains one after the other.
     group: usize,
 }
 
-/// A training stage. What one of them adds to [`Trainer`] is its losses, its schedule and its
-/// measurements.
+/// Training stage: the losses, schedule and measurements that it adds to [`Trainer`].
 pub(crate) trait Training {
-    /// What steps change beside splats, moments, cameras and the order of the views.
+    /// State that steps change besides splats, moments, cameras and the order of the views.
     type StageState: Serialize + DeserializeOwned;
 
     fn trainer(&self) -> &Trainer;
     fn trainer_mut(&mut self) -> &mut Trainer;
-    /// Sets what a step trains with: rates, SH bands, the size of the photos.
+    /// Sets rates and photo resolution of a step.
     fn schedule(&mut self, iteration: usize) -> Result<()>;
-    /// Forward, losses, backward and Adam of one view.
+    /// Records forward pass, losses, backward pass and Adam of one view.
     fn record(&self, view: usize) -> Recorder;
-    /// Reads back what the host needs of a step on `view`.
+    /// Reads the results of a step on `view` that the host needs.
     fn read_back(&mut self, view: usize, iteration: usize) -> Result<()>;
-    /// Between steps, `step` of them done: measures when it is time to, and removes splats.
+    /// Measures and prunes after `step` steps, where that is due.
     fn review(&mut self, step: usize) -> Result<StepReport>;
     fn stage_state(&self) -> Self::StageState;
-    fn set_stage_state(&mut self, figures: Self::StageState);
+    fn set_stage_state(&mut self, state: Self::StageState);
 
     /// One step on the next view.
     fn step(&mut self, iteration: usize) -> Result<()> {
@@ -73,31 +72,31 @@ pub(crate) trait Training {
     }
 }
 
-/// What [`Training::review`] found; empty between measurements.
+/// Result of [`Training::review`]; empty between measurements.
 #[derive(Default)]
 pub(crate) struct StepReport {
     /// Measurements by name, for [`Progress::figures`].
     pub(super) figures: Vec<(&'static str, f64)>,
-    /// The same for people, if there is something new to say.
+    /// New text for the progress line, if any.
     pub(super) note: Option<String>,
-    /// More steps would gain nothing.
+    /// True where more steps would gain nothing.
     pub(super) finished: bool,
 }
 
-/// What a step renders with, for benchmarks.
-pub(crate) struct Parts<'a> {
+/// Rasteriser, buffers and options of a step, for benchmarks.
+pub(crate) struct StepResources<'a> {
     pub raster: &'a Rasterizer,
     pub params: &'a SplatBuffers,
     pub gradients: &'a SplatBuffers,
     pub options: &'a RasterOptions,
 }
 
-/// A training under way, for going on after a kill. Of models trained one after the other only the
-/// current one is kept; those before it are trained again.
+/// Checkpoint of a training. Of models trained one after the other it holds the current one; those
+/// before it are trained again.
 #[derive(Serialize, Deserialize)]
 struct State<F> {
     group: usize,
-    /// Steps that are done.
+    /// Completed steps.
     done: usize,
     model: model::State,
     cameras: Vec<Camera>,
@@ -126,14 +125,14 @@ impl Trainer {
         }
     }
 
-    /// After a change of buffers or of what recordings contain.
+    /// Drops all recordings, after a change of their buffers or contents.
     pub(super) fn forget_recordings(&mut self) {
         self.programs.iter_mut().for_each(|p| *p = None);
     }
 
-    /// What a step of view 0 renders with.
-    pub(crate) fn parts(&self) -> Parts<'_> {
-        Parts {
+    /// Resources of a step on view 0.
+    pub(crate) fn step_resources(&self) -> StepResources<'_> {
+        StepResources {
             raster: &self.views.stage(0).raster,
             params: &self.model.values,
             gradients: &self.model.gradients,
@@ -142,8 +141,8 @@ impl Trainer {
     }
 }
 
-/// Trains model number `group` for `iterations` steps, or until a review ends it; goes on from the
-/// checkpoint, if there is one. `progress` counts the steps of all groups.
+/// Trains model number `group` for `iterations` steps or until a review ends it, from its
+/// checkpoint if there is one. `progress` counts the steps of all groups.
 pub(super) fn train<T: Training>(
     run: &mut T,
     group: usize,
@@ -185,7 +184,7 @@ pub(super) fn train<T: Training>(
     run.trainer().model.check(iterations)
 }
 
-/// Writes the state after `done` steps, if somebody keeps it.
+/// Writes a checkpoint after `done` steps, if `progress` keeps checkpoints.
 fn save<T: Training>(run: &T, done: usize, progress: &dyn Progress) -> Result<()> {
     let Some(checkpoint) = progress.checkpoint() else { return Ok(()) };
     let Trainer { group, model, cameras, order, .. } = run.trainer();
@@ -194,7 +193,7 @@ fn save<T: Training>(run: &T, done: usize, progress: &dyn Progress) -> Result<()
     checkpoint.save(done, &state)
 }
 
-/// Takes over the state of an earlier process, and says how many steps it has done.
+/// Restores the checkpoint of an earlier process; returns its completed steps.
 fn restore<T: Training>(run: &mut T, progress: &dyn Progress) -> Result<usize> {
     let kept = progress.checkpoint().and_then(|c| c.load::<State<T::StageState>>());
     let Some(kept) = kept.filter(|k| k.group == run.trainer().group) else { return Ok(0) };
@@ -221,7 +220,7 @@ mod tests {
 
     const COUNTED: usize = 8;
 
-    /// What a stage costs per step once every view has been recorded, and what it ends with.
+    /// Cost per step of a stage once every view is recorded, and its results.
     #[derive(Debug, PartialEq)]
     struct Outcome {
         submissions: f64,
@@ -259,9 +258,9 @@ mod tests {
         }
         let submissions = (device.submissions() - before.0) as f64 / COUNTED as f64;
         let allocations = (device.memory().allocations - before.1) as f64 / COUNTED as f64;
-        let parts = run.trainer().parts();
-        let (splats, features) = parts.params.download().unwrap();
-        let camera = parts.raster.camera().cast::<f32>().read().unwrap();
+        let resources = run.trainer().step_resources();
+        let (splats, features) = resources.params.download().unwrap();
+        let camera = resources.raster.camera().cast::<f32>().read().unwrap();
         Outcome { submissions, allocations, splats, features, camera }
     }
 
@@ -307,7 +306,7 @@ mod tests {
     }
 
     #[test]
-    fn a_step_is_one_submission_without_allocation_on_memory_that_is_not_mapped_too() {
+    fn step_is_one_submission_without_allocation() {
         let (mapped, staged) = (device(false), device(true));
         assert!(!staged.info().mapped);
         for stage in [colour, language] {
@@ -317,10 +316,10 @@ mod tests {
         }
     }
 
-    /// Only keeps a state.
-    struct Keeps(Checkpoint);
+    /// Progress with a checkpoint only.
+    struct CheckpointOnly(Checkpoint);
 
-    impl Progress for Keeps {
+    impl Progress for CheckpointOnly {
         fn begin(&self, _: &'static str, _: u64) {}
         fn step(&self, _: u64, _: &str) {}
         fn end(&self) {}
@@ -331,21 +330,21 @@ mod tests {
     }
 
     #[test]
-    fn what_goes_on_from_a_kept_state_ends_with_the_same_bits() {
+    fn resumed_training_has_the_same_bits() {
         let (device, options) = (device(false), colour_options());
         let (splats, cameras, images) = scene();
         let scale = SceneScale::measure(&cameras, &splats.means);
         let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
         let new = || RgbRun::new(&device, photos, &splats, scale, &options).unwrap();
         let folder = tempfile::tempdir().unwrap();
-        let keeps = Keeps(Checkpoint::new(folder.path().join("state"), Duration::ZERO, true));
+        let progress = CheckpointOnly(Checkpoint::new(folder.path().join("state"), Duration::ZERO, true));
         let (mut whole, mut resumed) = (new(), new());
         (0..COUNTED).for_each(|iteration| whole.step(iteration).unwrap());
-        save(&whole, COUNTED, &keeps).unwrap();
-        assert_eq!(restore(&mut resumed, &keeps).unwrap(), COUNTED);
+        save(&whole, COUNTED, &progress).unwrap();
+        assert_eq!(restore(&mut resumed, &progress).unwrap(), COUNTED);
         let [a, b] = [&mut whole, &mut resumed].map(|run| {
             (COUNTED..2 * COUNTED).for_each(|iteration| run.step(iteration).unwrap());
-            (run.trainer().parts().params.download().unwrap(), run.trainer().cameras.clone())
+            (run.trainer().step_resources().params.download().unwrap(), run.trainer().cameras.clone())
         });
         assert!(a == b, "other bits");
     }

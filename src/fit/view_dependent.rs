@@ -1,7 +1,6 @@
-//! Colours that depend on the direction they are seen from
-//! (docs/internals/method.md#view-dependent-colour): spherical harmonics on a trained geometry, of
-//! the degree that photos left out support.
-use super::coarse::Photos;
+//! View-dependent colour (docs/internals/method.md#view-dependent-colour): spherical harmonics on a
+//! trained geometry, of the degree that left-out photos support.
+use super::half_res::Photos;
 use super::init::raise_sh_degree;
 use super::options::{Rates, RgbOptions};
 use super::rgb::{Trained, fit_photos};
@@ -14,19 +13,18 @@ use crate::preset::Preset;
 use crate::progress::Progress;
 use crate::scene::{Camera, Coverage, RgbImage, Splats, sh_coefficients};
 
-/// The highest degree that files, viewers and passes know.
+/// Highest SH degree of files, viewers and passes.
 const HIGHEST: u32 = 3;
-/// Fewest photos that can say anything: with one left out of four, a splat is still seen from three
-/// directions.
+/// Fewest photos for cross-validation: with one left out of four, three directions of a splat
+/// remain.
 const FEWEST_PHOTOS: usize = 4;
-/// Parts that the photos are dealt into, one of which is left out at a time. More parts take longer
-/// in proportion.
+/// Number of folds of the cross-validation. The time is proportional to it.
 const PARTS: usize = 4;
 
 /// Options of [`fit_view_dependent`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ViewDependentOptions {
-    /// SH degree of the result, 0–3; `None` = what photos left out support.
+    /// SH degree of the result, 0–3; `None` = the degree that left-out photos support.
     pub degree: Option<u32>,
     /// Steps per photo.
     pub rounds: usize,
@@ -37,19 +35,18 @@ pub struct ViewDependentOptions {
 }
 
 impl ViewDependentOptions {
-    /// For a degree, or where that is open the one that photos support; the paper has none.
+    /// Options of a preset. Without a degree, the photos decide; with the paper's preset it is 0.
     pub fn preset(preset: Preset, degree: Option<u32>, seed: u64) -> Self {
-        let open = if preset == Preset::Paper { Some(0) } else { None };
-        ViewDependentOptions { degree: degree.or(open), rounds: 5, rates: [2e-2, 6e-3], seed }
+        let default = if preset == Preset::Paper { Some(0) } else { None };
+        ViewDependentOptions { degree: degree.or(default), rounds: 5, rates: [2e-2, 6e-3], seed }
     }
 }
 
-/// Gives trained splats SH coefficients of the highest degree by which photos gain that the colours
-/// were not fitted to, if any, and fits the colours to the photos. Everything else of the splats,
-/// and the cameras, stay to the bit.
+/// Fits view-dependent colour to trained splats. Without a given degree it is the highest SH degree
+/// that improves the PSNR of left-out photos ([`DegreeTrial::supported`], 4-fold cross-validation).
+/// Geometry, opacities and cameras stay to the bit.
 ///
-/// The splats themselves have seen all photos, so what is compared is only what the coefficients
-/// add.
+/// The splats were trained on all photos, so only the difference between degrees is meaningful.
 pub fn fit_view_dependent(
     device: &Device,
     images: &[RgbImage],
@@ -62,21 +59,21 @@ pub fn fit_view_dependent(
     let fit = Fit { device, coverage, options, progress };
     let (start, splats) = (result.splats.sh_degree, result.splats.len());
     let highest = highest(device.info().max_storage_range, splats);
-    let asked = options.degree.map(|d| d.min(highest));
-    if asked < options.degree {
+    let given = options.degree.map(|d| d.min(highest));
+    if given < options.degree {
         progress.warn(&format!(
             "{splats} splats of a higher SH degree than {highest} need larger buffers than the device binds; trained with {highest}"
         ));
     }
-    let most = asked.unwrap_or(highest);
+    let most = given.unwrap_or(highest);
     let mut trials = Vec::new();
-    if most > start && (asked.is_some() || images.len() >= FEWEST_PHOTOS) {
+    if most > start && (given.is_some() || images.len() >= FEWEST_PHOTOS) {
         progress.begin("view dependence", 2 + u64::from(most - start));
-        if asked.is_none() {
+        if given.is_none() {
             trials = fit.trials(images, &result.cameras, &result.splats, most)?;
         }
         let supported = trials.last().filter(|t: &&DegreeTrial| t.supported()).map(|t| t.degree);
-        if let Some(degree) = asked.or(supported) {
+        if let Some(degree) = given.or(supported) {
             let with = fit.colours(images, &result.cameras, coverage, &result.splats, degree)?;
             (result.splats, result.stats.psnr) = (with.splats, with.stats.psnr);
         }
@@ -86,8 +83,8 @@ pub fn fit_view_dependent(
     Ok(result)
 }
 
-/// The highest degree whose coefficients the device binds: their two moments are the largest
-/// buffer. `range` in bytes.
+/// Highest degree whose coefficients the device binds; their two moments are the largest buffer.
+/// `range` is the largest binding, bytes.
 fn highest(range: u64, splats: usize) -> u32 {
     let bytes = |degree: u32| (2 * 4 * 3 * sh_coefficients(degree) * splats) as u64;
     (0..=HIGHEST).rev().find(|d| bytes(*d) <= range).unwrap_or(0)
@@ -95,14 +92,14 @@ fn highest(range: u64, splats: usize) -> u32 {
 
 struct Fit<'a> {
     device: &'a Device,
-    /// Of all photos.
+    /// Coverage of all photos.
     coverage: &'a [Option<Coverage>],
     options: &'a ViewDependentOptions,
     progress: &'a dyn Progress,
 }
 
 impl Fit<'_> {
-    /// Fits the colours, of a degree; nothing else moves.
+    /// Fits the colours at an SH degree; all other parameters stay.
     fn colours(
         &self,
         images: &[RgbImage],
@@ -133,8 +130,8 @@ impl Fit<'_> {
         fit_photos(self.device, photos, start, scale, &options, &quiet)
     }
 
-    /// Degrees from the highest down until photos left out gain by one. A degree is compared with
-    /// the colours of the splats fitted as long, because they have not come to rest.
+    /// Tries degrees from the highest down until left-out photos support one. A degree is compared
+    /// with the colours of the splats fitted for as many steps, because they have not converged.
     fn trials(
         &self,
         images: &[RgbImage],
@@ -142,11 +139,12 @@ impl Fit<'_> {
         splats: &Splats,
         most: u32,
     ) -> Result<Vec<DegreeTrial>> {
-        let without = self.left_out(images, cameras, splats, splats.sh_degree)?;
+        let without = self.left_out_psnr(images, cameras, splats, splats.sh_degree)?;
         let mut trials = Vec::new();
         for degree in (splats.sh_degree + 1..=most).rev() {
             self.progress.step(1 + trials.len() as u64, &format!("degree {degree}"));
-            let trial = DegreeTrial::of(degree, &self.left_out(images, cameras, splats, degree)?, &without);
+            let trial =
+                DegreeTrial::of(degree, &self.left_out_psnr(images, cameras, splats, degree)?, &without);
             trials.push(trial);
             if trial.supported() {
                 break;
@@ -155,8 +153,8 @@ impl Fit<'_> {
         Ok(trials)
     }
 
-    /// PSNR of every photo when the colours are fitted to the other parts of the photos, dB.
-    fn left_out(
+    /// PSNR of every photo with the colours fitted to the other folds, dB.
+    fn left_out_psnr(
         &self,
         images: &[RgbImage],
         cameras: &[Camera],
@@ -182,7 +180,7 @@ impl Fit<'_> {
     }
 }
 
-/// Only passes on that the work should stop: the parts of a stage are not stages.
+/// Progress that forwards only warnings and cancellation, for parts of a stage.
 struct Quiet<'a>(&'a dyn Progress);
 
 impl Progress for Quiet<'_> {
@@ -202,7 +200,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn more_splats_take_a_lower_degree() {
+    fn highest_degree_falls_with_splats() {
         // The two moments of a splat of degree 3 take 2 · 4 · 3 · 16 = 384 bytes.
         let range = 128 << 20;
         let degrees = [100_000, 349_525, 349_526, 621_378, 621_379, 1_398_101, 5_000_000];

@@ -1,5 +1,5 @@
-//! The training views in GPU memory, in the bands that the device binds, and one rasteriser per
-//! image size.
+//! Training views in GPU memory, in the bands that the device binds, and one rasteriser per image
+//! size.
 use crate::gpu::{self, Buffer, Device};
 use crate::pass::bands::Band;
 use crate::pass::metrics::planar;
@@ -15,20 +15,19 @@ use super::model::Model;
 pub(super) struct TrainView {
     /// Index into [`Views::stages`].
     pub(super) stage: usize,
-    /// Per band [3, rows, W] of the photo, [4, rows, W] with the weights of the pixels where some
-    /// do not count.
+    /// Per band [3, rows, W] of the photo, or [4, rows, W] with pixel weights where some are
+    /// unused.
     pub(super) target: Vec<Buffer<f32>>,
-    /// The sum of the weights, where some do not count.
+    /// Sum of the pixel weights, where there are some.
     pub(super) covered: Option<f64>,
-    /// Per band [rows, W] the alpha that renders should have, −1 where another band answers; where
-    /// emptiness is shown.
+    /// Per band [rows, W] the wanted alpha, −1 in the halo; for photos with an empty background.
     pub(super) alpha: Option<Vec<Buffer<f32>>>,
-    /// Per band [rows, W] depth where it is trusted and the band's own, else 0; and the number of
-    /// trusted pixels.
+    /// Per band [rows, W] depth where it is confident, 0 elsewhere and in the halo; and the number
+    /// of confident pixels.
     pub(super) depth: Option<(Vec<Buffer<f32>>, usize)>,
 }
 
-/// What views of one size share.
+/// Buffers that views of one size share.
 pub(super) struct SizeBuffers {
     pub(super) raster: Rasterizer,
     pub(super) loss: SsimL1,
@@ -47,19 +46,19 @@ impl SizeBuffers {
         Ok(SizeBuffers { raster, loss, sums })
     }
 
-    /// Where the sums of a band begin.
+    /// Slot of the first sum of a band.
     pub(super) fn slot(&self, band: &Band) -> u32 {
         (SUMS * band.index) as u32
     }
 
-    /// [`SUMS`] numbers added up over the bands.
+    /// The [`SUMS`] sums, added up over the bands.
     pub(super) fn total(&self) -> Result<[f64; SUMS]> {
         let sums = self.sums.read()?;
         Ok(std::array::from_fn(|k| sums.iter().skip(k).step_by(SUMS).map(|v| f64::from(*v)).sum()))
     }
 }
 
-/// All views.
+/// All training views.
 pub(super) struct Views {
     pub(super) list: Vec<TrainView>,
     pub(super) stages: Vec<SizeBuffers>,
@@ -67,7 +66,7 @@ pub(super) struct Views {
 }
 
 impl Views {
-    /// Uploads photos (and depth) and makes the rasterisers, for `capacity` splats with
+    /// Uploads photos and depth and allocates the rasterisers, for `capacity` splats with
     /// `feature_dim` features.
     pub(super) fn new(
         device: &Device,
@@ -92,7 +91,9 @@ impl Views {
                 }
             };
             let depth = match depths {
-                Some((maps, least)) => maps.get(i).map(|m| trusted(m, least, image)).transpose()?.flatten(),
+                Some((maps, least)) => {
+                    maps.get(i).map(|m| confident_depth(m, least, image)).transpose()?.flatten()
+                }
                 None => None,
             };
             let bands = &views.stages[stage].raster.frame().bands;
@@ -109,7 +110,7 @@ impl Views {
                 Some(c) if c.outside == Outside::Unknown => {
                     let weights = c.weights().data;
                     photo.extend(&weights);
-                    // A photo without any counts for nothing, whatever it is divided by.
+                    // Without used pixels the loss is 0, also divided by 1.
                     Some(weights.iter().map(|w| f64::from(*w)).sum::<f64>().max(1.0))
                 }
                 _ => None,
@@ -129,17 +130,17 @@ impl Views {
         Ok(views)
     }
 
-    /// The stage of a view.
+    /// Buffers of the size of a view.
     pub(super) fn stage(&self, view: usize) -> &SizeBuffers {
         &self.stages[self.list[view].stage]
     }
 
-    /// The same, to change it.
+    /// [`Views::stage`], mutable.
     pub(super) fn stage_mut(&mut self, view: usize) -> &mut SizeBuffers {
         &mut self.stages[self.list[view].stage]
     }
 
-    /// Chooses what the next run renders.
+    /// Sets the camera of the next run on a view.
     pub(super) fn set_camera(&self, view: usize, camera: &Camera) -> Result<()> {
         self.stage(view).raster.set_view(&View::new(camera, self.near))
     }
@@ -155,17 +156,17 @@ impl Views {
         self.set_camera(view, camera)?;
         let (width, height) = (camera.width as usize, camera.height as usize);
         let mut image = RgbImage { width, height, data: Vec::with_capacity(width * height) };
-        let seen = |frame: &FrameBuffers, band: &Band| {
+        let read = |frame: &FrameBuffers, band: &Band| {
             image.data.extend(colours(frame, band)?);
             Ok(())
         };
-        self.stage_mut(view).raster.forward_bands(&model.values, options, seen)?;
+        self.stage_mut(view).raster.forward_bands(&model.values, options, read)?;
         Ok(image)
     }
 
-    /// What the view's rasteriser last rendered: colours clipped to [0, 1]. `None` where that was
-    /// only a band of it.
-    pub(super) fn shown(&self, view: usize) -> Result<Option<RgbImage>> {
+    /// Last render of the rasteriser of a view, with colours clipped to [0, 1]; `None` where the
+    /// image has several bands.
+    pub(super) fn last_render(&self, view: usize) -> Result<Option<RgbImage>> {
         let frame = self.stage(view).raster.frame();
         if frame.bands.count() > 1 {
             return Ok(None);
@@ -175,15 +176,16 @@ impl Views {
     }
 }
 
-/// What a band answers for, clipped to [0, 1].
+/// Colours of the inner pixels of a band, clipped to [0, 1].
 fn colours(frame: &FrameBuffers, band: &Band) -> Result<Vec<[f32; 3]>> {
     let (stride, rows) = (frame.bands.pixels(), frame.bands.stored(band));
     let planes = frame.planes.read_range(0..3 * stride)?;
     Ok(rows.map(|i| [0, 1, 2].map(|c| planes[c * stride + i].clamp(0.0, 1.0))).collect())
 }
 
-/// Depth where confidence suffices, and how many pixels that are; `None` when there are none.
-fn trusted(map: &DepthMap, least: f32, image: &RgbImage) -> Result<Option<(Vec<f32>, usize)>> {
+/// Depth where its confidence is at least `least`, and the number of such pixels; `None` without
+/// any.
+fn confident_depth(map: &DepthMap, least: f32, image: &RgbImage) -> Result<Option<(Vec<f32>, usize)>> {
     if map.depth.data.len() != image.data.len() || map.confidence.data.len() != image.data.len() {
         return Err(Error::work("a depth map does not have the size of its photo"));
     }

@@ -4,7 +4,7 @@ use splatvk_gpu::Cache;
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// Most bytes of all compiled pipelines together: those of drivers that are gone make room.
+/// Most bytes of all compiled pipelines together; the least recently used ones are removed.
 const CAPACITY: u64 = 256 << 20;
 const PIPELINES: &str = "pipelines";
 
@@ -18,7 +18,7 @@ impl FolderCache {
         files::home().ok().map(|home| FolderCache(home.join("cache")))
     }
 
-    /// Where it keeps its files.
+    /// Path of the folder.
     pub fn path(&self) -> &Path {
         &self.0
     }

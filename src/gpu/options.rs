@@ -3,8 +3,8 @@ use super::folder::FolderCache;
 use splatvk_gpu::{Cache, Device, Options};
 use std::sync::Arc;
 
-/// Opens the preferred device, or the one whose index or part of whose name is `choice`, with
-/// [`options`].
+/// Opens the preferred device with [`options`], or the one with `choice` as its index or a part of
+/// its name.
 ///
 /// # Errors
 /// Those of [`Device::open`].

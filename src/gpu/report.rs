@@ -2,11 +2,11 @@
 use super::options::options;
 use splatvk_gpu::{DeviceInfo, Error, INSTALL, Survey, Surveyed, survey};
 
-/// How a line of the report turned out.
+/// Judgement of a line of the report.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Status {
-    /// There and good.
+    /// Present and good.
     Ok,
     /// Works, but something optional is missing or slow.
     Note,
@@ -21,9 +21,9 @@ pub struct Line {
     pub topic: String,
     /// Judgement.
     pub status: Status,
-    /// What was found.
+    /// Finding.
     pub found: String,
-    /// What to do, when `status` is not [`Status::Ok`].
+    /// Advice, when `status` is not [`Status::Ok`].
     pub advice: Option<String>,
 }
 
@@ -31,7 +31,7 @@ fn line(topic: &str, status: Status, found: impl Into<String>, advice: Option<&s
     Line { topic: topic.to_owned(), status, found: found.into(), advice: advice.map(str::to_owned) }
 }
 
-/// Looks at loader, devices and the features of the device that would be used (`choice` as in
+/// Reports loader, devices and the features of the device that would be used (`choice` as in
 /// [`super::open`]). Never fails: a missing part is a line.
 pub fn vulkan(choice: Option<&str>) -> Vec<Line> {
     let missing = |topic: &str, found: String| line(topic, Status::Missing, found, Some(INSTALL));
@@ -66,7 +66,7 @@ pub fn vulkan(choice: Option<&str>) -> Vec<Line> {
     lines
 }
 
-/// Required and optional features and the limits that matter.
+/// Appends lines on required and optional features and on limits.
 fn describe(info: &DeviceInfo, lines: &mut Vec<Line>) {
     use splatvk_gpu::Capability::*;
     if info.is_cpu {
@@ -105,8 +105,7 @@ fn describe(info: &DeviceInfo, lines: &mut Vec<Line>) {
         lines.push(line("switched off", Status::Note, names.join(", "), Some(advice)));
     }
     let mib = |bytes: u64| bytes >> 20;
-    // One feature plane set of 20 channels at 1 Mpixel in f32 takes 80 MB; Vulkan itself only
-    // promises 128 MiB.
+    // A set of 20 channels at 1 Mpixel in f32 takes 80 MB; Vulkan guarantees 128 MiB.
     lines.push(line(
         "limits",
         Status::Ok,
@@ -126,7 +125,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn reports_the_device_in_use_and_an_unknown_choice() {
+    fn report_names_device_and_unknown_choice() {
         let lines = vulkan(None);
         assert!(lines.iter().all(|l| l.status != Status::Missing), "{lines:?}");
         assert!(lines.iter().any(|l| l.topic == "in use"));

@@ -1,9 +1,8 @@
-//! The device of the tests.
+//! Device of the tests.
 use super::options::options;
 use splatvk_gpu::TestDevice;
 
-/// The device that all tests of a process share, with validation on. `SPLATVK_DEVICE` picks another
-/// one than the first.
+/// Device that all tests of a process share, with validation on; `SPLATVK_DEVICE` chooses it.
 pub fn test_device() -> TestDevice {
     TestDevice::shared(&options(None))
 }

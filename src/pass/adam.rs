@@ -1,5 +1,5 @@
-//! Adam on the GPU (Kingma & Ba 2015), with a learning rate per parameter class that the host sets
-//! before each step.
+//! Adam on the GPU (Kingma & Ba 2015). The host sets a learning rate per parameter class before
+//! each step.
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 
@@ -10,8 +10,8 @@ pub const EPSILON: f64 = shaders::adam::EPS;
 /// Threads per workgroup in `glsl/adam.comp` and `glsl/gather.comp`.
 const GROUP: usize = shaders::adam::WORKGROUP[0] as usize;
 
-/// Workgroup counts for `threads` in a shader that numbers its groups row by row: at most 32768 a
-/// row, since one dimension may end at 65535.
+/// Workgroup counts for `threads` in a shader that numbers its workgroups row by row: at most 32768
+/// per row, since a dimension may be limited to 65535.
 pub(crate) fn rows_of_groups(threads: usize) -> [u32; 3] {
     let groups = threads.div_ceil(GROUP).max(1);
     let row = groups.min(32768);
@@ -41,11 +41,12 @@ pub struct Class {
     pub count: usize,
     /// Period of the two rates.
     pub stride: u32,
-    /// How many of each period use the head rate.
+    /// Number of values of each period with the head rate.
     pub head: u32,
 }
 
-/// The rates of the current step in GPU memory, one row per class, and the count of bad gradients.
+/// Rates of the current step in GPU memory, one row per class, and the count of non-finite
+/// gradients.
 pub struct Schedule {
     rates: Buffer<f32>,
     faults: Buffer<u32>,
@@ -70,13 +71,13 @@ impl Schedule {
         Ok(self.rates.write(self.rows.as_flattened())?)
     }
 
-    /// How many non-finite gradients the steps so far have met (and skipped).
+    /// Number of non-finite gradients that the steps so far have skipped.
     pub fn faults(&self) -> Result<u32> {
         Ok(self.faults.read()?.first().copied().unwrap_or(0))
     }
 
-    /// Records one step of one class; `guard[1] ≠ 0` on the GPU makes it void (see the rasteriser's
-    /// status).
+    /// Records one step of one class. The step is void where `guard[1] ≠ 0` on the GPU; the guard
+    /// is the status of the rasteriser.
     pub fn record(
         &self,
         rec: &mut Recorder,
@@ -115,7 +116,7 @@ fn row_of(step: usize, rate: [f64; 2]) -> [f32; 4] {
     [(rate[0] * first) as f32, (rate[1] * first) as f32, second as f32, 0.0]
 }
 
-/// The CPU reference of one step for one class with one rate; `moments` are (m, v).
+/// CPU reference of one step for one class with one rate; `moments` are (m, v).
 pub fn adam(parameters: &mut [f64], gradients: &[f64], moments: &mut [[f64; 2]], rate: f64, step: usize) {
     let t = step.max(1) as f64;
     for ((p, &g), mv) in parameters.iter_mut().zip(gradients).zip(moments) {
@@ -135,7 +136,7 @@ mod tests {
     use crate::math::Random;
 
     #[test]
-    fn gpu_equals_the_twin_over_many_steps_and_rates() {
+    fn adam_on_device_matches_reference() {
         let device = crate::gpu::test_device();
         let mut random = Random::new(4);
         // 9 values per row: 3 at the head rate, 6 at the tail rate; not a multiple of the
@@ -173,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn non_finite_gradients_are_counted_and_change_nothing() {
+    fn adam_skips_and_counts_non_finite() {
         let device = crate::gpu::test_device();
         let parameters = device.buffer_from("p", &[1.0f32, 2.0, 3.0]).unwrap();
         let gradients = device.buffer_from("g", &[f32::NAN, f32::NEG_INFINITY, 1.0]).unwrap();
@@ -198,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn groups_cover_all_threads_within_device_limits() {
+    fn rows_of_groups_cover_all_threads() {
         for threads in [1, 256, 257, 8_388_608, 8_388_609, 50_000_000] {
             let [x, y, _] = rows_of_groups(threads);
             assert!(x as usize * y as usize * GROUP >= threads && x <= 32768 && y <= 65535);

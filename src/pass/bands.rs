@@ -1,46 +1,46 @@
-//! Images larger than a device binds at once are rendered in bands of rows.
+//! Bands of rows, for images larger than a device binds at once.
 //!
-//! What exceeds a binding first are the planes of an image: 4 bytes per pixel and channel, 52
-//! channels with three levels of 16 features. A band has its own planes, targets and labels; splats
-//! are projected and sorted once for all bands, and what flows back from every band adds up in the
-//! same gradients. Bands overlap by 16 rows on either side, which are rendered for the windows of
-//! SSIM and have no loss of their own. An image that fits is one band: the whole.
+//! The planes of an image exceed a binding first: 4 bytes per pixel and channel, 52 channels with
+//! three levels of 16 features. A band has its own planes, targets and labels; splats are projected
+//! and sorted once for all bands, and the gradients of all bands add up in the same buffers. Bands
+//! overlap by 16 rows on either side, which are rendered for the windows of SSIM and have no loss
+//! of their own. An image that fits is one band.
 use crate::gpu::DeviceInfo;
 use crate::{Error, Result};
 use std::ops::Range;
 
-/// Rows on either side of a band that its neighbours answer for: SSIM's gradient reaches twice five
-/// rows, and whole tiles and SSIM's strips of 16 rows keep every sum in the order that it has in a
-/// whole image.
+/// Rows on either side of a band that belong to its neighbours: the gradient of SSIM reaches twice
+/// five rows, and whole tiles and strips of 16 rows keep every sum in the order of a whole image.
 const HALO: usize = 16;
-/// Bands that answer for fewer rows than these render mostly halo.
+/// Fewest inner rows of a band; smaller bands render mostly halo.
 const FEWEST_ROWS: usize = 16;
 /// Bytes per pixel of the widest buffer of SSIM, vec2 for three colours.
 const SSIM_BYTES: u64 = 24;
 /// Threads of the passes that have one thread per pixel of a band in a one-dimensional dispatch.
 const THREADS: u64 = 64;
 
-/// The rows that one set of planes holds.
+/// Rows that one set of planes holds.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Band {
     /// Position among the bands.
     pub index: usize,
     /// First row of the image that is stored.
     pub top: usize,
-    /// Rows that are stored, alike in all bands.
+    /// Number of stored rows, equal in all bands.
     pub rows: usize,
-    /// Rows of the image that this band answers for; the bands' make up the image.
+    /// Inner rows: the rows of the image with a loss in this band. Those of all bands make up the
+    /// image.
     pub inner: Range<usize>,
 }
 
-/// How an image is divided.
+/// Division of an image into bands.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Bands {
     /// Pixels.
     pub width: usize,
     /// Pixels.
     pub height: usize,
-    /// Rows that are stored at once.
+    /// Rows stored at once.
     pub rows: usize,
     tops: Vec<usize>,
 }
@@ -51,15 +51,15 @@ fn pixel_bytes(planes: usize) -> u64 {
     (4 * (planes as u64 + 1)).max(SSIM_BYTES)
 }
 
-/// Pixels with `planes` channels that the device holds at once.
+/// Most pixels with `planes` channels that the device holds at once.
 fn most_pixels(device: &DeviceInfo, planes: usize) -> usize {
     let bound = device.max_storage_range / pixel_bytes(planes);
     bound.min(u64::from(device.max_groups[0]) * THREADS) as usize
 }
 
-/// The widest image with `planes` channels that the device renders in bands.
+/// Width of the widest image with `planes` channels that the device renders in bands, pixels.
 pub fn widest(device: &DeviceInfo, planes: usize) -> usize {
-    // Up to 15 rows more than asked for: see `Bands::new`.
+    // `Bands::new` may need up to 15 rows more.
     most_pixels(device, planes) / (2 * HALO + FEWEST_ROWS + 15)
 }
 
@@ -69,14 +69,17 @@ impl Bands {
         Bands { width, height, rows: height, tops: vec![0] }
     }
 
-    /// As few bands as the device allows for an image with `planes` channels.
+    /// Divides an image with `planes` channels into as few bands as the device allows.
+    ///
+    /// # Errors
+    /// Where the image is wider than [`widest`].
     pub fn new(device: &DeviceInfo, width: usize, height: usize, planes: usize) -> Result<Bands> {
         let fit = most_pixels(device, planes) / width.max(1);
         if height <= fit {
             return Ok(Bands::whole(width, height));
         }
-        // Every band is aligned to 16 rows and stores as many as the others, so that a plane begins
-        // at one place in all of them: the stored rows leave the same remainder as the height.
+        // Every band is aligned to 16 rows and stores equally many, so that a plane begins at the
+        // same offset in all of them: the stored rows leave the same remainder as the height.
         let rows = fit.saturating_sub(height % 16) / 16 * 16 + height % 16;
         if rows < 2 * HALO + FEWEST_ROWS || width > widest(device, planes) {
             return Err(Error::gpu(format!(
@@ -92,12 +95,12 @@ impl Bands {
         Ok(Bands { width, height, rows, tops })
     }
 
-    /// How many there are.
+    /// Number of bands.
     pub fn count(&self) -> usize {
         self.tops.len()
     }
 
-    /// One of them.
+    /// Band by index.
     pub fn get(&self, index: usize) -> Band {
         let top = self.tops[index];
         let begin = if index == 0 { 0 } else { top + HALO };
@@ -105,17 +108,17 @@ impl Bands {
         Band { index, top, rows: self.rows, inner: begin..end }
     }
 
-    /// All, from top to bottom.
+    /// All bands, from top to bottom.
     pub fn iter(&self) -> impl Iterator<Item = Band> + '_ {
         (0..self.count()).map(|k| self.get(k))
     }
 
-    /// Pixels that are stored at once.
+    /// Pixels stored at once.
     pub fn pixels(&self) -> usize {
         self.width * self.rows
     }
 
-    /// What a band stores of `planes` [C, H, W].
+    /// Stored rows of a band cut out of `planes` [C, H, W].
     pub fn cut<T: Copy>(&self, band: &Band, planes: &[T]) -> Vec<T> {
         let rows = band.top * self.width..(band.top + band.rows) * self.width;
         planes
@@ -125,7 +128,7 @@ impl Bands {
             .collect()
     }
 
-    /// [`Bands::cut`] with `void` in the rows that others answer for.
+    /// [`Bands::cut`] with `void` in the halo rows.
     pub fn cut_inner<T: Copy>(&self, band: &Band, planes: &[T], void: T) -> Vec<T> {
         let mut out = self.cut(band, planes);
         for plane in out.chunks_exact_mut(self.pixels().max(1)) {
@@ -135,12 +138,12 @@ impl Bands {
         out
     }
 
-    /// Pixels of the image that a band answers for.
+    /// Inner pixels of a band, as a range of the image.
     pub fn inner(&self, band: &Band) -> Range<usize> {
         band.inner.start * self.width..band.inner.end * self.width
     }
 
-    /// The same pixels within what is stored.
+    /// Inner pixels of a band, as a range of the stored pixels.
     pub fn stored(&self, band: &Band) -> Range<usize> {
         (band.inner.start - band.top) * self.width..(band.inner.end - band.top) * self.width
     }
@@ -152,7 +155,7 @@ mod tests {
     use crate::gpu::test_device;
 
     #[test]
-    fn bands_cover_the_image_once_with_a_halo() {
+    fn bands_cover_the_image_once() {
         let mut info = test_device().info().clone();
         for mib in [16, 64, 128] {
             info.max_storage_range = mib << 20;
@@ -187,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_cut_out_is_what_the_band_holds() {
+    fn cut_returns_the_stored_rows() {
         let bands = Bands { width: 2, height: 96, rows: 64, tops: vec![0, 32] };
         let planes: Vec<u32> = (0..2 * 2 * 96).collect();
         let band = bands.get(1);

@@ -1,9 +1,9 @@
 //! Tile lists: for every 8×8 tile the splats that can change it, nearest first.
 //!
-//! Splats in depth order are asked how many tiles they touch, a scan of these counts gives every
-//! (splat, tile) entry its place, and lanes with equal shares of the entries write them. What
-//! remains is a stable grouping by tile: on a CPU device by counting, with a counter per tile and
-//! lane, on a GPU by a radix sort of the tile's few bits. No (tile, depth) pair is ever sorted.
+//! The first pass counts the tiles of each splat in depth order. A scan of these counts gives every
+//! (splat, tile) entry its position, and lanes with equal shares of the entries write them. A
+//! stable grouping by tile follows: on a CPU device by counting, with a counter per tile and lane,
+//! on a GPU by a radix sort of the few bits of the tile. No (tile, depth) pair is ever sorted.
 //!
 //! A splat is listed where `max over the tile's pixel centres of o e^p ≥ 1/255`:
 //! `glsl/shared/tiles.glsl`.
@@ -14,9 +14,9 @@ use super::tile_lists::{Group, SORTING_LANES, TILE, TileLists};
 use crate::gpu::{Buffer, Recorder, shaders};
 use std::ops::Range;
 
-/// Records counting, writing and grouping of the entries of `count` depth-sorted splats
-/// (`splat_count` holds the same number on the device) on these rows of tiles; the lists land in
-/// `frame.lists`, the number of entries needed in `frame.status`.
+/// Records counting, writing and grouping of the entries of `count` depth-sorted splats on these
+/// rows of tiles; `splat_count` holds the same number on the device. Writes the lists to
+/// `frame.lists`, the number of entries needed to `frame.status`.
 pub(super) fn record(
     rec: &mut Recorder,
     frame: &FrameBuffers,
@@ -43,7 +43,7 @@ pub(super) fn record(
         }
         Group::Sorting { .. } => (1, SORTING_LANES),
     };
-    // The buffers of the other grouping are ignored by the shader; any will do.
+    // The shader does not use the buffers of the other grouping; any buffer may be bound there.
     let (counters, entry_splats) = match &lists.group {
         Group::Counting { counters, .. } => (counters, counters),
         Group::Sorting { entry_splats, .. } => (entry_splats, entry_splats),
@@ -134,7 +134,8 @@ fn group_by_sorting(
     rec.dispatch_threads(call, [SORTING_LANES, 1, 1]);
 }
 
-/// The lists, by asking every pixel of every tile: `[tiles]`, each nearest first as `order` is.
+/// CPU reference of the lists, `[tiles]`, each in the order of `order`: tests every splat against
+/// every tile.
 pub fn reference(projected: &[Option<Projected>], order: &[u32], size: [u32; 2]) -> Vec<Vec<u32>> {
     let tiles = size.map(|s| s.div_ceil(TILE));
     let mut lists = vec![Vec::new(); (tiles[0] * tiles[1]) as usize];
@@ -150,8 +151,7 @@ pub fn reference(projected: &[Option<Projected>], order: &[u32], size: [u32; 2])
     lists
 }
 
-/// Largest o e^p over the rectangle spanned by the 8×8 pixel centres (not only at the centres, as
-/// the walk does).
+/// Largest o e^p over the rectangle spanned by the 8×8 pixel centres, not only at the centres.
 fn largest_alpha(p: &Projected, x0: u32, y0: u32) -> f64 {
     let [a, b, c] = p.conic;
     let power = |dx: f64, dy: f64| -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy;
@@ -160,7 +160,7 @@ fn largest_alpha(p: &Projected, x0: u32, y0: u32) -> f64 {
     if x0 <= 0.0 && x1 >= 0.0 && y0 <= 0.0 && y1 >= 0.0 {
         return p.opacity;
     }
-    // Outside: the maximum lies on the boundary, on each edge at the vertex of a parabola.
+    // Outside, the maximum lies on the boundary, on each edge at the vertex of a parabola.
     let on_vertical = |dx: f64| power(dx, (-b * dx / c).clamp(y0, y1));
     let on_horizontal = |dy: f64| power((-b * dy / a).clamp(x0, x1), dy);
     let best = on_vertical(x0).max(on_vertical(x1)).max(on_horizontal(y0)).max(on_horizontal(y1));

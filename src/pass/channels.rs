@@ -1,12 +1,12 @@
-//! Blocks of channels: what one launch of the raster kernels blends.
+//! Blocks of channels, one per dispatch of the raster kernels.
 use crate::gpu::shaders;
 
-/// RGB and depth come before the d features in every stack of planes.
+/// Number of channels before the d features in every stack of planes: RGB and depth.
 pub const BASE_CHANNELS: usize = shaders::shared::layout::BASE_CHANNELS as usize;
 
-/// A block of channels that one launch of the raster kernels handles: their cost per pixel and
-/// splat has a fixed part, but their registers grow with the channels, so 48 features go in three
-/// launches of at most 16.
+/// Block of channels of one dispatch of the raster kernels. Their cost per pixel and splat has a
+/// fixed part, but their registers grow with the channels, so 48 features take three dispatches of
+/// 16.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Block {
     /// The kernel variant: 4, 7, 12, 20 with RGB and depth, 16 without.
@@ -15,7 +15,7 @@ pub(super) struct Block {
     pub first_vector: u32,
     /// First plane of the block.
     pub first_plane: u32,
-    /// Features in this block (the rest of the variant's room stays unused).
+    /// Features in this block; the variant may have room for more.
     pub features: u32,
 }
 
@@ -27,10 +27,10 @@ impl Block {
     }
 }
 
-/// Features of one launch.
+/// Most features of one dispatch.
 const BLOCK_FEATURES: u32 = 16;
 
-/// Splits d features into launches; the first carries RGB and depth too.
+/// Splits d features into dispatches; the first also has RGB and depth.
 pub(super) fn blocks(dim: u32) -> Vec<Block> {
     let features = dim.min(BLOCK_FEATURES);
     let channels = match features {

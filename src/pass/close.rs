@@ -1,33 +1,34 @@
-//! Comparison of computed numbers with reference numbers, for tests and [`crate::check`]: one bound
-//! on the whole, one on every element, and an explicit budget for the few that a threshold tips to
-//! the other side.
+//! Comparison of computed with reference numbers, for tests and [`crate::check`]: a bound on the
+//! whole array, a bound on every element, and a budget of outliers, for elements where a threshold
+//! decides differently.
 use std::fmt;
 
-/// What [`compare`] demands.
+/// Bounds of [`compare`].
 #[derive(Clone, Copy, Debug)]
 pub struct Tolerance {
     /// ‖a − b‖₂ ≤ `relative_l2` · ‖b‖₂, taken over the elements within their own bound.
     pub relative_l2: f64,
-    /// |a − b| ≤ `absolute` + `relative` · |b| per element, …
+    /// Bound of an element: |a − b| ≤ `absolute` + `relative` · |b|.
     pub absolute: f64,
-    /// … see above …
+    /// Relative part of the bound of an element.
     pub relative: f64,
-    /// … except for at most this share of the elements.
+    /// Largest share of elements outside their bound.
     pub outliers: f64,
-    /// Outliers too must stay within this many times their bound.
+    /// Bound of these outliers, in multiples of the bound of an element.
     pub outlier_factor: f64,
 }
 
-/// Images (docs/internals/method.md#tolerances). A contribution at the α threshold of 1/255 may be
-/// counted by one side and not by the other, which is worth up to 1/255 of a channel value; at most
-/// 2 pixels in 10 000 may show that.
+/// Tolerance of images (docs/internals/method.md#tolerances). One side may count a contribution at
+/// the α threshold of 1/255 that the other skips, up to 1/255 of a channel value; at most 2 pixels
+/// in 10 000 may differ by that.
 pub const IMAGE: Tolerance =
     Tolerance { relative_l2: 1e-4, absolute: 1e-4, relative: 1e-5, outliers: 2e-4, outlier_factor: 200.0 };
 
-/// One class of gradients: relative 1e-3 in the L2 sense (docs/internals/method.md#tolerances;
-/// measured 4e-7 to 4e-6). Single elements are sums of many terms of both signs, so each is also
-/// allowed 2e-3 of the class's root mean square; a contribution at the α threshold that one side
-/// counts and the other does not may push 2 % of the elements of a small class beyond that.
+/// Tolerance of one class of gradients: relative L2 error 1e-3
+/// (docs/internals/method.md#tolerances; measured 4e-7 to 4e-6). Elements are sums of many terms of
+/// both signs, so each is also allowed 2e-3 of the root mean square of the class. A contribution at
+/// the α threshold that one side counts and the other skips may push 2 % of the elements of a small
+/// class beyond that.
 pub fn gradient_tolerance(reference: &[f64]) -> Tolerance {
     let rms = (reference.iter().map(|x| x * x).sum::<f64>() / reference.len().max(1) as f64).sqrt();
     Tolerance {
@@ -39,18 +40,18 @@ pub fn gradient_tolerance(reference: &[f64]) -> Tolerance {
     }
 }
 
-/// How far apart two arrays are.
+/// Distance of two arrays.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Distance {
     /// ‖a − b‖₂ / ‖b‖₂ over inliers.
     pub relative_l2: f64,
     /// Largest |a − b|, outliers included.
     pub worst: f64,
-    /// Where it is.
+    /// Index of that element.
     pub worst_at: usize,
     /// Elements outside their bound.
     pub outliers: usize,
-    /// Elements in all.
+    /// Number of elements.
     pub count: usize,
 }
 
@@ -64,9 +65,11 @@ impl fmt::Display for Distance {
     }
 }
 
-/// Compares `actual` with `reference`; the error says which demand failed and by how much.
+/// Compares `actual` with `reference`.
 ///
-/// Not-a-number in either array always fails; an infinite one too.
+/// # Errors
+/// Names the bound that was exceeded. A number that is not finite, in either array, is always an
+/// error.
 pub fn compare(actual: &[f32], reference: &[f64], tolerance: &Tolerance) -> Result<Distance, String> {
     if actual.len() != reference.len() {
         return Err(format!("{} elements against {}", actual.len(), reference.len()));
@@ -96,7 +99,7 @@ pub fn compare(actual: &[f32], reference: &[f64], tolerance: &Tolerance) -> Resu
             ));
         }
     }
-    // An all-zero reference has no scale: only the element bounds speak then.
+    // An all-zero reference has no scale: only the bounds of the elements count.
     d.relative_l2 = if norm2 > 0.0 { (error2 / norm2).sqrt() } else { 0.0 };
     if d.outliers as f64 > tolerance.outliers * d.count as f64 {
         return Err(format!("too many outliers: {d}"));
@@ -115,13 +118,13 @@ mod tests {
         Tolerance { relative_l2: 1e-3, absolute: 1e-6, relative: 1e-3, outliers: 0.0, outlier_factor: 1.0 };
 
     #[test]
-    fn equal_passes_and_reports_zero() {
+    fn compare_equal_arrays_reports_zero() {
         let d = compare(&[1.0, -2.0], &[1.0, -2.0], &STRICT).unwrap();
         assert_eq!((d.outliers, d.worst, d.relative_l2), (0, 0.0, 0.0));
     }
 
     #[test]
-    fn each_demand_can_fail() {
+    fn compare_each_exceeded_bound_fails() {
         assert!(compare(&[1.0], &[1.0, 2.0], &STRICT).is_err(), "length");
         assert!(compare(&[f32::NAN], &[1.0], &STRICT).is_err(), "NaN");
         assert!(compare(&[f32::INFINITY], &[f64::INFINITY], &STRICT).is_err(), "infinite");
@@ -133,7 +136,7 @@ mod tests {
     }
 
     #[test]
-    fn the_outlier_budget_is_a_budget() {
+    fn compare_outliers_over_budget_fail() {
         let budget = Tolerance { outliers: 0.25, outlier_factor: 100.0, ..STRICT };
         let reference = [1.0; 8];
         let mut actual = [1.0f32; 8];

@@ -1,12 +1,12 @@
-//! The language loss: L1 between rendered features and the code of each labelled pixel
-//! (docs/internals/method.md#language-loss), and the upstream that lifts codes onto splats
+//! Language loss: L1 between rendered features and the code of each labelled pixel
+//! (docs/internals/method.md#language-loss), and the upstream gradient that lifts codes onto splats
 //! (docs/internals/method.md#lifting).
 use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 
-/// What one view is compared with.
+/// Targets of one view.
 pub struct Targets<'a> {
-    /// [levels, H·W] row of `codes`, −1 = none.
+    /// [levels, H·W] rows of `codes`, −1 = none.
     pub labels: &'a Buffer<i32>,
     /// [ΣK, width] codes of all levels.
     pub codes: &'a Buffer<f32>,
@@ -18,21 +18,21 @@ pub struct Targets<'a> {
     pub width: u32,
 }
 
-/// What becomes of the feature planes of the upstream stack.
+/// Values of the feature planes of the upstream stack.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// The gradient of the loss.
+    /// Gradient of the loss.
     Loss,
-    /// The code itself: back-propagated, it gives `Σ w·c` per splat; and 1 for colour number
-    /// `level` of labelled pixels, which gives `Σ w` ([`FrameBuffers::colour_gradients`]). The
-    /// colours' planes of the upstream stay so until something else writes them.
+    /// The code, whose back-propagation gives `Σ w·c` per splat; and 1 for colour number `level` of
+    /// labelled pixels, which gives `Σ w` ([`FrameBuffers::colour_gradients`]). Leaves these values
+    /// in the colour planes of the upstream stack.
     Lift,
     /// `F − c`, the gradient of half the square: least squares.
     Residual,
 }
 
-/// Records the loss of a frame, or of the band in its planes: writes the feature planes of
-/// `frame.planes_grad` and, per pixel, `loss` [H·W].
+/// Records the loss of the band in the planes of a frame: writes the feature planes of
+/// `frame.planes_grad` and the loss per pixel, `loss` [H·W].
 pub fn record(rec: &mut Recorder, targets: &Targets, frame: &FrameBuffers, loss: &Buffer<f32>, mode: Mode) {
     rec.pass("feature loss");
     let pixels = frame.pixels();
@@ -62,7 +62,7 @@ fn record_planes(
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
 
-/// The CPU reference of the loss for one level: (loss per pixel, gradient [width, pixels]) of planar
+/// CPU reference of the loss for one level: (loss per pixel, gradient [width, pixels]) of planar
 /// features.
 pub fn code_l1(
     labels: &[i32],
@@ -89,7 +89,7 @@ mod tests {
     use crate::math::Random;
 
     #[test]
-    fn gpu_equals_the_twin_and_unlabelled_pixels_have_no_influence() {
+    fn code_l1_on_device_matches_reference() {
         let device = crate::gpu::test_device();
         let mut random = Random::new(21);
         let (pixels, levels, width, codes) = (301usize, 2usize, 5usize, 4usize);
@@ -139,7 +139,7 @@ mod tests {
             assert_eq!(wide(&upstream[planes_of]), gradient);
         }
         assert!(loss.iter().zip(&expected).all(|(a, b)| (f64::from(*a) - b).abs() < 1e-5));
-        // Whatever is rendered where there is no label, every bit of the upstream stays.
+        // Rendered features of unlabelled pixels do not change a bit of the upstream.
         for level in 0..levels {
             for p in (0..pixels).filter(|p| labels[level * pixels + p] < 0) {
                 (0..width).for_each(|k| planes[(4 + level * width + k) * pixels + p] = 1e6);
@@ -159,9 +159,9 @@ mod tests {
         let (residual, _) = run(&planes, Mode::Residual);
         for p in 0..pixels {
             let code = |k: usize| table[labels[p] as usize * width + k];
-            let at = |k: usize| (4 + k) * pixels + p;
-            let wanted = |k: usize| if labels[p] < 0 { 0.0 } else { planes[at(k)] - code(k) };
-            assert!((0..width).all(|k| residual[at(k)] == wanted(k)));
+            let index = |k: usize| (4 + k) * pixels + p;
+            let expected = |k: usize| if labels[p] < 0 { 0.0 } else { planes[index(k)] - code(k) };
+            assert!((0..width).all(|k| residual[index(k)] == expected(k)));
         }
     }
 }

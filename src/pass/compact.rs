@@ -1,5 +1,5 @@
-//! Pruning and compaction: which splats stay, and moving their rows (parameters and optimiser state
-//! alike) together.
+//! Pruning and compaction: chooses the splats to keep and moves their rows of parameters and
+//! optimiser state together.
 use super::adam::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
@@ -16,7 +16,7 @@ pub fn kept(opacity_logits: &[f32], min_opacity: f32) -> Vec<u32> {
         .collect()
 }
 
-/// A buffer with the rows `index` of `from`, each `stride` elements of 32 bits.
+/// Copies the rows `index` of `from`, each `stride` elements of 32 bits, to a new buffer.
 pub fn gather<T: Pod>(
     device: &Device,
     name: &'static str,
@@ -37,7 +37,7 @@ pub fn gather<T: Pod>(
     Ok(to.cast())
 }
 
-/// The CPU reference of [`gather`].
+/// CPU reference of [`gather`].
 pub fn gather_rows<T: Copy>(from: &[T], index: &[u32], stride: usize) -> Vec<T> {
     index.iter().flat_map(|&i| &from[i as usize * stride..][..stride]).copied().collect()
 }
@@ -48,7 +48,7 @@ mod tests {
     use crate::math::Random;
 
     #[test]
-    fn gpu_equals_the_twin() {
+    fn gather_matches_reference() {
         let device = crate::gpu::test_device();
         let mut random = Random::new(11);
         let logits: Vec<f32> = (0..1003).map(|_| random.normal() as f32 * 4.0).collect();
@@ -64,9 +64,9 @@ mod tests {
         }
     }
 
-    /// Workgroups of 256 numbers stand in rows of 32768.
+    /// Workgroups of 256 numbers are dispatched in rows of 32768.
     #[test]
-    fn more_numbers_than_a_row_of_workgroups_are_all_moved() {
+    fn gather_beyond_workgroup_row_is_complete() {
         let device = crate::gpu::test_device();
         let (stride, index) = (1usize << 16, [0u32, 1].repeat(65));
         assert!(rows_of_groups(index.len() * stride)[1] > 1);
@@ -81,7 +81,7 @@ mod tests {
     }
 
     #[test]
-    fn pruning_keeps_order_and_drops_what_is_faint_or_broken() {
+    fn kept_drops_faint_and_broken_splats() {
         let logit = |o: f32| (o / (1.0 - o)).ln();
         assert_eq!(kept(&[logit(0.9), logit(0.004), f32::NAN, logit(0.006), f32::INFINITY], 0.005), [0, 3]);
     }

@@ -1,10 +1,10 @@
-//! Rendered features to code indices: `k*(p) = argmax_k F(p)·c_k`, brute force over the codes of a
-//! level.
+//! Decoding of rendered features to code indices: `k*(p) = argmax_k F(p)·c_k`, brute force over the
+//! codes of a level.
 use crate::gpu::shaders::decode::{MIN_FEATURE_SHARE, PIXELS, VOID_ALPHA, WORKGROUP};
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::{Error, Result};
 
-/// Code widths that glsl/decode.comp is compiled for; others are padded with zeros to the next.
+/// Code widths of the variants of glsl/decode.comp; other codes are padded with zeros.
 const WIDTHS: [usize; 4] = [4, 8, 16, 32];
 
 /// Pixels per workgroup.
@@ -19,7 +19,7 @@ pub struct Codes {
 }
 
 impl Codes {
-    /// `codes` is `[K, dim]`, row-major, unit rows; `dim` at most 32.
+    /// Uploads `codes`, `[K, dim]`, row-major, unit rows; `dim` is 1 to 32.
     pub fn upload(device: &Device, codes: &[f32], dim: usize) -> Result<Codes> {
         let Some(&width) = WIDTHS.iter().find(|&&w| w >= dim).filter(|_| dim > 0) else {
             return Err(Error::work(format!("codes have {dim} components, the decoder takes 1 to 32")));
@@ -33,10 +33,10 @@ impl Codes {
         Ok(Codes { buffer, count: (codes.len() / dim) as u32, dim: dim as u32, width: width as u32 })
     }
 
-    /// Decodes `pixels` pixels. `features` is planar `[planes, pixels]`, the level's channels are
-    /// the planes `first_plane..first_plane + dim`; `transmittance` is `[pixels]`, 1 − alpha.
-    /// Writes `decoded`, `[pixels]` of `i32` with −1 where alpha < 0.5, where ‖F‖ < alpha / 4 and
-    /// without codes. Twin: [`decode_pixels`].
+    /// Records the decoding of `pixels` pixels. `features` is planar `[planes, pixels]`, with the
+    /// level in the planes `first_plane..first_plane + dim`; `transmittance` is `[pixels]`, 1 −
+    /// alpha. Writes `decoded`, `[pixels]` of `i32` with −1 where alpha < 0.5, where ‖F‖ < alpha /
+    /// 4 and without codes. Reference: [`decode_pixels`].
     pub fn record(
         &self,
         rec: &mut Recorder,
@@ -61,32 +61,34 @@ impl Codes {
     }
 }
 
-/// Twin of [`Codes::record`], in f64: per pixel of planar `features` `[dim, P]` and `alpha` `[P]`
-/// the code, and by how much it won, `(F·c_1 − F·c_2) / ‖F‖`: within rounding of 0 the device may
-/// take the other.
+/// CPU reference of [`Codes::record`], in f64: code per pixel of planar `features` `[dim, P]` and
+/// `alpha` `[P]`, and its margin `(F·c_1 − F·c_2) / ‖F‖`. Where the margin is within rounding of 0
+/// the device may choose the other code.
 pub fn decode_pixels(codes: &[f32], dim: usize, features: &[f32], alpha: &[f32]) -> (Vec<i32>, Vec<f64>) {
     let pixels = alpha.len();
-    let decode = |p: usize| {
-        let feature: Vec<f64> = (0..dim).map(|c| f64::from(features[c * pixels + p])).collect();
-        let norm = feature.iter().map(|f| f * f).sum::<f64>().sqrt();
-        let (mut chosen, mut best, mut second) = (-1, f64::NEG_INFINITY, -norm);
-        for (k, code) in codes.chunks_exact(dim).enumerate() {
-            let score = code.iter().zip(&feature).map(|(c, f)| f64::from(*c) * f).sum::<f64>();
-            if score > best {
-                second = if k == 0 { -norm } else { best };
-                (chosen, best) = (k as i32, score);
-            } else if k == 1 || score > second {
-                second = score;
-            }
+    let feature = |p: usize| -> Vec<f64> { (0..dim).map(|c| f64::from(features[c * pixels + p])).collect() };
+    (0..pixels).map(|p| decode_pixel(codes, &feature(p), alpha[p])).unzip()
+}
+
+/// Code and margin of one pixel.
+fn decode_pixel(codes: &[f32], feature: &[f64], alpha: f32) -> (i32, f64) {
+    let norm = feature.iter().map(|f| f * f).sum::<f64>().sqrt();
+    let (mut chosen, mut best, mut second) = (-1, f64::NEG_INFINITY, -norm);
+    for (k, code) in codes.chunks_exact(feature.len()).enumerate() {
+        let score = code.iter().zip(feature).map(|(c, f)| f64::from(*c) * f).sum::<f64>();
+        if score > best {
+            second = if k == 0 { -norm } else { best };
+            (chosen, best) = (k as i32, score);
+        } else if k == 1 || score > second {
+            second = score;
         }
-        let shown = alpha[p] >= VOID_ALPHA as f32 && norm >= MIN_FEATURE_SHARE * f64::from(alpha[p]);
-        if !shown || chosen < 0 {
-            (if shown { chosen } else { -1 }, 0.0)
-        } else {
-            (chosen, if norm > 0.0 { (best - second) / norm } else { 0.0 })
-        }
-    };
-    (0..pixels).map(decode).unzip()
+    }
+    let shown = alpha >= VOID_ALPHA as f32 && norm >= MIN_FEATURE_SHARE * f64::from(alpha);
+    if !shown || chosen < 0 {
+        (if shown { chosen } else { -1 }, 0.0)
+    } else {
+        (chosen, if norm > 0.0 { (best - second) / norm } else { 0.0 })
+    }
 }
 
 #[cfg(test)]
@@ -112,7 +114,7 @@ mod tests {
         rows
     }
 
-    /// Decodes on the device with two planes of rubbish before the features.
+    /// Decodes on the device, with two planes of noise before the features.
     fn on_device(codes: &[f32], dim: usize, features: &[f32], alpha: &[f32]) -> Vec<i32> {
         let device = test_device();
         let planes = [noise(2 * alpha.len(), 99).as_slice(), features].concat();
@@ -128,27 +130,27 @@ mod tests {
     }
 
     #[test]
-    fn equals_its_twin() {
+    fn decode_matches_reference() {
         for (dim, count, pixels) in
             [(3, 50, 700), (4, 2, 256), (5, 1, 1), (8, 20, 257), (16, 100, 300), (20, 7, 64)]
         {
             let codes = unit_rows(noise(count * dim, dim as u64), dim);
             let features = noise(dim * pixels, 7);
             let alpha: Vec<f32> = noise(pixels, 8).iter().map(|a| 0.5 + 0.5 * a).collect();
-            let (twin_code, twin_margin) = decode_pixels(&codes, dim, &features, &alpha);
+            let (expected, margin) = decode_pixels(&codes, dim, &features, &alpha);
             let code = on_device(&codes, dim, &features, &alpha);
             for p in 0..pixels {
                 // Sums of at most 32 products of numbers below 1 in f32: 32 × 6e-8 × ‖F‖, over ‖F‖,
                 // twice.
                 let tolerance = 8e-6;
-                assert!(code[p] == twin_code[p] || twin_margin[p] < tolerance, "{dim} {p}");
+                assert!(code[p] == expected[p] || margin[p] < tolerance, "{dim} {p}");
             }
             assert!(pixels < 64 || code.contains(&-1), "some pixel is transparent");
         }
     }
 
     #[test]
-    fn ties_take_the_lowest_code_and_no_code_is_void() {
+    fn decode_ties_take_the_lowest_code() {
         let codes = [0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0];
         assert_eq!(on_device(&codes, 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]), [1, 0]);
         assert_eq!(on_device(&[], 2, &[2.0, 0.0, 0.0, 2.0], &[1.0, 1.0]), [-1, -1]);
@@ -157,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pixel_whose_splats_have_no_feature_has_no_code() {
+    fn pixels_without_features_have_no_code() {
         let codes = [1.0, 0.0, 0.0, 1.0];
         // One code; an even mix of both; almost nothing; nothing.
         let (first, second) = ([0.9, 0.45, 0.0, 0.0], [0.0, 0.45, 0.1, 0.0]);
@@ -168,7 +170,7 @@ mod tests {
     }
 
     #[test]
-    fn refuses_wide_codes_and_missing_planes() {
+    fn wide_codes_and_missing_planes_fail() {
         let device = test_device();
         assert!(Codes::upload(&device, &[0.0; 66], 33).is_err());
         let codes = Codes::upload(&device, &[1.0, 0.0], 2).unwrap();

@@ -1,4 +1,4 @@
-//! Buffers of one frame, and the gradients that its backward pass keeps per entry of the tile
+//! Buffers of one frame, and the gradients that its backward pass stores per entry of the tile
 //! lists.
 use super::bands::Bands;
 use super::channels::{Block, blocks};
@@ -9,14 +9,14 @@ use crate::pass::KernelVariant;
 use crate::sync::lock;
 use std::ops::Range;
 
-/// Buffers of one frame; pixel planes are planar [C, H, W], f32, with H the rows of one band where
-/// there are several.
+/// Buffers of one frame. Pixel planes are planar [C, H, W], f32; H is the stored rows of a band
+/// where there are several bands.
 pub struct FrameBuffers {
     /// Pixels.
     pub width: u32,
     /// Pixels.
     pub height: u32,
-    /// How the image is divided; one band if it fits.
+    /// Bands of the image; one if it fits.
     pub bands: Bands,
     /// d.
     pub feature_dim: usize,
@@ -24,14 +24,14 @@ pub struct FrameBuffers {
     pub planes: Buffer<f32>,
     /// [H, W] final transmittance T_f; alpha = 1 − T_f.
     pub transmittance: Buffer<f32>,
-    /// [4 + d + 1, H, W]: the loss's gradient by `planes` and, last, by alpha. Zero at first; a
-    /// loss overwrites the planes it uses. Read by the backward pass.
+    /// [4 + d + 1, H, W]: gradient of the loss by `planes` and, last, by alpha. Zero at first; a
+    /// loss overwrites the planes that it uses. Read by the backward pass.
     pub planes_grad: Buffer<f32>,
     /// [10]: gradient by the left pose twist (ρ, θ) and by fx, fy, cx, cy. Written by the backward
     /// pass.
     pub camera_grad: Buffer<f32>,
     /// [3] u32: tile-list entries of this frame; the number needed if a frame did not fit since the
-    /// last `grow`, else 0; the longest list of a tile so far, where lists are made by counting.
+    /// last `grow`, else 0; the longest tile list so far, with [`super::TileBinning::Counting`].
     pub status: Buffer<u32>,
     pub(super) projected: Buffer<f32>,
     pub(super) projected_grad: Buffer<f32>,
@@ -44,7 +44,7 @@ pub struct FrameBuffers {
     pub(super) lists: TileLists,
 }
 
-/// Rows of tiles of the image that a raster pass works on.
+/// Rows of tiles of a raster pass.
 #[derive(Clone)]
 pub(super) struct Tiles {
     pub rows: Range<u32>,
@@ -55,13 +55,13 @@ pub(super) struct Tiles {
 }
 
 impl FrameBuffers {
-    /// Pixels that the planes hold: the image's, or a band's.
+    /// Pixels of the planes: those of the image, or of a band.
     pub fn pixels(&self) -> u32 {
         self.bands.pixels() as u32
     }
 
-    /// [N, 3] the last backward pass's gradient by the colour of every splat: `∂L/∂c_i = Σ_px
-    /// w_i(px) ∂L/∂C(px)`, so that an upstream of ones gives the blending weight of each.
+    /// [N, 3] gradient by the colour of every splat in the last backward pass: `∂L/∂c_i = Σ_px
+    /// w_i(px) ∂L/∂C(px)`, so that an upstream of ones gives the blending weights.
     pub fn colour_gradients(&self, splats: usize) -> Result<Vec<[f32; 3]>> {
         const FIRST: usize = shaders::shared::layout::MOMENTS as usize;
         let sums = self.projected_grad.read_range(0..GRADIENT_FLOATS * splats)?;
@@ -72,6 +72,7 @@ impl FrameBuffers {
     pub(super) fn tiles(&self) -> [u32; 2] {
         [self.width.div_ceil(TILE), self.height.div_ceil(TILE)]
     }
+
     /// Floats per splat in `codes`: d, rounded up to whole vectors.
     pub(super) fn code_stride(&self) -> u32 {
         (self.feature_dim as u32).next_multiple_of(4)
@@ -85,29 +86,31 @@ pub(super) const PROJECTED_FLOATS: usize = shaders::shared::layout::PROJECTED_FL
 /// Gradient by the camera: twist (ρ, θ), fx, fy, cx, cy.
 pub(super) const CAMERA_GRADIENTS: usize = shaders::shared::layout::CAMERA_GRADIENTS as usize;
 
-/// Bytes per entry of the widest buffer that [`GradientReduction::Entries`] needs: the features of one
-/// launch.
+/// Bytes per entry of the widest buffer of [`GradientReduction::Entries`]: the features of one
+/// dispatch.
 pub(super) fn entry_bytes(feature_dim: usize) -> usize {
     4 * GRADIENT_FLOATS.max(4 * widest_block(feature_dim) as usize)
 }
 
-/// Vectors of features in the widest launch.
+/// Vectors of features in the widest dispatch.
 fn widest_block(feature_dim: usize) -> u32 {
     blocks(feature_dim as u32).iter().map(Block::vectors).max().unwrap_or(0)
 }
 
-/// How the gradients that one splat gets from several tiles are added up.
+/// Reduction of the gradients of one splat over its tiles.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GradientReduction {
     /// Float atomics: no memory, but the order of the additions, and so the last digits, differ
     /// from run to run.
     Atomics,
-    /// Every tile stores what it adds, and a second pass sums per splat: the same bits on every
-    /// run, for 48 bytes per entry and about a tenth more time per step (lavapipe, 100,000 splats).
+    /// Every tile stores its gradients per entry, and a second pass sums them per splat: the same
+    /// bits on every run, for 48 bytes per entry and about a tenth more time per step (lavapipe,
+    /// 100,000 splats).
     Entries,
 }
 
-/// Gradients per entry of the tile lists; made when first needed, since rendering alone does not.
+/// Gradients per entry of the tile lists; allocated at first use, since rendering does not need
+/// them.
 #[derive(Default)]
 pub(super) struct GradientEntries(std::sync::Mutex<Option<EntryBuffers>>);
 
@@ -121,8 +124,7 @@ pub(super) struct EntryBuffers {
 }
 
 impl GradientReduction {
-    /// The faster way, unless the device was opened to be deterministic or gives wrong results by
-    /// it.
+    /// The faster reduction, unless it is disabled or the device was opened as deterministic.
     pub fn of(device: &Device) -> GradientReduction {
         let info = device.info();
         match KernelVariant::AtomicGradients.or_replacement(info) {
@@ -133,6 +135,7 @@ impl GradientReduction {
 }
 
 impl GradientEntries {
+    /// Buffers for the present capacity of the tile lists.
     pub fn buffers(&self, device: &Device, frame: &FrameBuffers) -> gpu::Result<EntryBuffers> {
         let mut made = lock(&self.0);
         let capacity = frame.lists.capacity;

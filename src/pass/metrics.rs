@@ -8,7 +8,7 @@ pub fn psnr(rendered: &RgbImage, target: &RgbImage) -> f64 {
     psnr_masked(rendered, target, |_| true)
 }
 
-/// [`psnr`] over the pixels for which `keep(index)` holds; infinite when nothing differs.
+/// [`psnr`] over the pixels for which `keep(index)` holds; infinite for equal images.
 pub fn psnr_masked(rendered: &RgbImage, target: &RgbImage, keep: impl Fn(usize) -> bool) -> f64 {
     let (mut sum, mut count) = (0.0f64, 0usize);
     for (i, (a, b)) in rendered.data.iter().zip(&target.data).enumerate() {
@@ -37,13 +37,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_constant_offset_has_the_textbook_psnr() {
+    fn psnr_constant_offset_matches_formula() {
         let target = RgbImage { width: 4, height: 3, data: vec![[0.25; 3]; 12] };
         let rendered = RgbImage { data: vec![[0.35; 3]; 12], ..target.clone() };
         assert!((psnr(&rendered, &target) - 20.0).abs() < 1e-4);
         assert!(psnr(&target, &target).is_infinite());
         assert!((ssim(&target, &target) - 1.0).abs() < 1e-12);
-        // A viewer shows white and black.
+        // Colours beyond white and black are clipped.
         let target = RgbImage { data: vec![[1.0, 0.0, 0.25]; 12], ..target };
         let rendered = RgbImage { data: vec![[7.0, -3.0, 0.25]; 12], ..target.clone() };
         assert!(psnr(&rendered, &target).is_infinite());

@@ -1,14 +1,14 @@
-//! How to render.
+//! Options of a render.
 
-/// How stored features become rendered ones (docs/internals/method.md#feature-gauge).
+/// Map from stored to rendered features (docs/internals/method.md#feature-gauge).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum FeatureMode {
-    /// f̂ = f / (‖f‖ + ε), the parameterisation of the paper, for each of several blocks of equal
-    /// length (one per level).
+    /// f̂ = f / (‖f‖ + ε), the parameterisation of the paper, per block; blocks have equal length,
+    /// one per level.
     Gauge {
-        /// ε
+        /// ε.
         epsilon: f32,
-        /// Blocks.
+        /// Number of blocks.
         blocks: usize,
     },
     /// f̂ = f.
@@ -16,7 +16,7 @@ pub enum FeatureMode {
 }
 
 impl FeatureMode {
-    /// As the shaders take it: ε, negative for [`FeatureMode::Linear`].
+    /// ε as the shaders take it, negative for [`FeatureMode::Linear`].
     pub fn epsilon(self) -> f32 {
         match self {
             FeatureMode::Gauge { epsilon, .. } => epsilon,
@@ -34,12 +34,12 @@ impl FeatureMode {
     }
 }
 
-/// How to render.
+/// Options of a render.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RasterOptions {
-    /// Degree used, at most the stored one.
+    /// SH degree to render, at most the stored one.
     pub sh_degree: u32,
-    /// From stored to rendered features.
+    /// Map from stored to rendered features.
     pub feature_mode: FeatureMode,
     /// Whether the loss on the features reaches means, scales, rotations and opacities.
     pub features_move_geometry: bool,

@@ -1,15 +1,14 @@
-//! Planes of a rendered frame to texels as host programs want them.
+//! Packing of rendered planes into texels for host programs.
 use super::bands::Band;
 use super::channels::BASE_CHANNELS;
 use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::{Error, Result};
 
-/// What to take from a frame.
+/// Channels of a frame to pack.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FrameChannel {
-    /// R, G, B on the background (not clamped where the encoding holds more than [0, 1]), and
-    /// alpha.
+    /// R, G, B on the background and alpha; only [`Encoding::Unorm8x4`] clamps to [0, 1].
     Colour,
     /// Accumulated opacity.
     Alpha,
@@ -19,7 +18,7 @@ pub enum FrameChannel {
     Features(usize, usize),
 }
 
-/// How texels are stored.
+/// Storage of texels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Encoding {
     /// 32-bit floats, all channels of a pixel side by side: `[H, W, C]`.
@@ -27,9 +26,9 @@ pub enum Encoding {
     /// 32-bit floats in groups of four, the last one filled up with zeros: `[⌈C/4⌉, H, W, 4]`,
     /// layers of an RGBA image.
     F32x4,
-    /// 16-bit floats in such groups.
+    /// 16-bit floats in groups of four.
     F16x4,
-    /// 8-bit unorm in such groups.
+    /// 8-bit unorm in groups of four.
     Unorm8x4,
 }
 
@@ -85,7 +84,7 @@ impl Encoding {
     }
 }
 
-/// A buffer of exactly [`Encoding::bytes`] for a part of an image.
+/// Allocates a buffer of exactly [`Encoding::bytes`] for `pixels` pixels.
 pub fn texels(
     device: &Device,
     pixels: usize,
@@ -95,8 +94,8 @@ pub fn texels(
     Ok(device.buffer::<u32>("texels", encoding.bytes(source.channels(), pixels) / 4)?)
 }
 
-/// Packs what a band of a rendered frame answers for into the [`texels`] of the image. Twin:
-/// [`texels_of`].
+/// Packs the inner pixels of a band of a rendered frame into the [`texels`] of the image.
+/// Reference: [`texels_of`].
 pub fn pack(
     device: &Device,
     frame: &FrameBuffers,
@@ -134,7 +133,7 @@ pub fn pack(
     Ok(rec.run()?)
 }
 
-/// Twin of [`pack`]: bytes of the texels from `planes` [C, P] and `transmittance` [P].
+/// CPU reference of [`pack`]: bytes of the texels from `planes` [C, P] and `transmittance` [P].
 pub fn texels_of(planes: &[f32], transmittance: &[f32], source: FrameChannel, encoding: Encoding) -> Vec<u8> {
     let pixels = transmittance.len();
     let channels = source.channels();
@@ -171,7 +170,7 @@ mod tests {
     use crate::pass::Rasterizer;
 
     #[test]
-    fn every_source_in_every_encoding_equals_its_twin() {
+    fn pack_every_encoding_matches_reference() {
         let device = test_device();
         let (width, height, dim) = (19u32, 7u32, 6usize);
         let pixels = (width * height) as usize;
@@ -201,8 +200,7 @@ mod tests {
                         assert!((step(a) - step(b)).abs() <= 1);
                     }
                 } else if source == FrameChannel::Depth && encoding != Encoding::Unorm8x4 {
-                    // Vulkan allows a quotient 2.5 units in the last place; an NVIDIA H200 makes
-                    // use of it.
+                    // Vulkan allows a quotient an error of 2.5 ULP; an NVIDIA H200 has such errors.
                     for (a, b) in got.chunks(4).zip(expected.chunks(4)) {
                         let unit = |v: &[u8]| i64::from(u32::from_le_bytes([v[0], v[1], v[2], v[3]]));
                         assert!((unit(a) - unit(b)).abs() <= 3, "{encoding:?}");
@@ -219,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_packed_band_by_band_makes_up_the_image() {
+    fn packed_bands_make_up_the_image() {
         let options = Options { max_binding: Some(1 << 18), ..crate::gpu::options(None) };
         let device = TestDevice::open(&options).unwrap();
         let (width, height, dim) = (80u32, 150u32, 3usize);

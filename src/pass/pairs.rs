@@ -1,10 +1,10 @@
-//! Pixel–splat pairs: how many the raster kernels evaluate, and how many of those change a pixel.
+//! Counts of pixel–splat pairs: evaluated by the raster kernels, and blended into a pixel.
 use super::rasterizer::Rasterizer;
 use super::tile_lists::TILE;
 use crate::Result;
 use crate::gpu::{Device, Recorder, shaders};
 
-/// [evaluated, blended] pairs of the last forward pass.
+/// Counts the [evaluated, blended] pairs of the last forward pass.
 pub fn count(device: &Device, raster: &Rasterizer) -> Result<[f64; 2]> {
     let frame = raster.frame();
     let tiles = frame.tiles();
@@ -36,7 +36,7 @@ mod tests {
     use crate::scene::seeded;
 
     #[test]
-    fn counts_equal_the_twins() {
+    fn pair_counts_match_reference() {
         let device = crate::gpu::test_device();
         let (splats, camera) = seeded::benchmark(600, 75, 53, 0, 2);
         let view = View::new(&camera, 0.05);

@@ -1,4 +1,4 @@
-//! Raw splat parameters and gradients as the f64 references see them.
+//! Raw splat parameters and gradients in f64, for the references.
 use crate::scene::{Splats, sh_coefficients};
 use glam::{DVec3, DVec4};
 
@@ -26,7 +26,7 @@ pub struct Params {
 }
 
 impl Params {
-    /// Widens host splats and their features ([N, d], may be empty with d = 0).
+    /// Converts host splats and their features [N, d] (empty for d = 0) to f64.
     pub fn new(splats: &Splats, features: &[f32], feature_dim: usize) -> Params {
         let wide = |v: &[f32; 3]| DVec3::new(v[0].into(), v[1].into(), v[2].into());
         Params {
@@ -46,7 +46,7 @@ impl Params {
         }
     }
 
-    /// Zeros of the same shape: the gradient accumulator.
+    /// Zeros of the same shape, to accumulate gradients.
     pub fn zeros_like(&self) -> Params {
         let n = self.means.len();
         Params {

@@ -1,5 +1,5 @@
-//! Slanted-plane multi-view matching on the device. What the shaders compute is written down in the
-//! CPU reference, [`super::plane_sweep_cpu`].
+//! Slanted-plane multi-view matching on the device. The equations are those of the CPU reference,
+//! [`super::plane_sweep_cpu`].
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep::VIEW_SHARES;
 use crate::gpu::shaders::{plane_sweep, plane_sweep_refine, structs};
@@ -8,14 +8,14 @@ use glam::Vec4;
 use splatvk_sfm::stereo::PLANE_BYTES;
 pub use splatvk_sfm::stereo::{MAX_SOURCES, Matcher, PlaneSweep, ReferenceView, SourceView, binding};
 
-/// The shader mixes as many sources.
+/// The shader mixes [`MAX_SOURCES`] sources.
 const _: () = assert!(MAX_SOURCES == VIEW_SHARES.len());
 
-/// The plane sweep of stereo on a device.
+/// Plane sweep of stereo on a device.
 pub struct DevicePlaneSweep(Device);
 
 impl DevicePlaneSweep {
-    /// On this device.
+    /// Plane sweep on this device.
     pub fn new(device: &Device) -> Self {
         DevicePlaneSweep(device.clone())
     }
@@ -37,21 +37,21 @@ impl PlaneSweep for DevicePlaneSweep {
     }
 }
 
-/// A source view as the shader has it.
+/// Source view in the layout of the shader.
 fn to_gpu(view: &SourceView) -> structs::SourceView {
     let SourceView { forward, back, centre, intrinsics, size } = *view;
     structs::SourceView { forward, back, centre, intrinsics, size }
 }
 
-/// Matching at one resolution on the device. Where it does not bind the planes of all views at
-/// once, those of a reference and its sources are brought together for every pass.
+/// Matching at one resolution on the device. Where the device does not bind the planes of all views
+/// at once, every pass copies those of a reference and its sources into one buffer.
 pub struct GpuMatcher {
     device: Device,
     sources: Buffer<structs::SourceView>,
-    /// What a pass binds: all views, or one group.
+    /// Luma quads that a pass binds: of all views, or of one group.
     quads: Buffer<u32>,
     planes: Buffer<f32>,
-    /// Every view on its own, where they are grouped.
+    /// Buffers of each view, where views are grouped; else empty.
     views: Vec<ViewBuffers>,
     /// Pixels of all views.
     pixels: usize,
@@ -61,12 +61,13 @@ pub struct GpuMatcher {
 struct ViewBuffers {
     quads: Buffer<u32>,
     planes: Buffer<f32>,
-    /// Views that a pass with this reference needs, itself first.
+    /// This view and its sources, by index.
     group: Vec<usize>,
 }
 
 impl GpuMatcher {
-    /// `luma` and `planes` (π, cost) hold all views one after the other, as the references say.
+    /// Uploads `luma` and `planes` (π, cost) of all views, one after the other, at the offsets of
+    /// the references.
     pub fn new(
         device: &Device,
         luma: &[f32],
@@ -93,7 +94,7 @@ impl GpuMatcher {
             let (mut group, mut held) = (vec![view], pixels_of(r));
             for source in &mut grouped[r.first_source as usize..(r.first_source + r.sources) as usize] {
                 group.extend(references.iter().position(|other| other.first == source.size[2]));
-                // Where the source's pixels lie in the group.
+                // Offset of the source's pixels in the group.
                 let own = (source.size[0] * source.size[1]) as usize;
                 source.size[2] = held as u32;
                 held += own;
@@ -116,7 +117,7 @@ impl GpuMatcher {
         })
     }
 
-    /// The view of a reference, where views are grouped.
+    /// Buffers of a reference view; `None` where views are not grouped.
     fn view_of(&self, r: &ReferenceView) -> Option<&ViewBuffers> {
         let mut first = 0;
         self.views.iter().find(|view| {
@@ -126,7 +127,7 @@ impl GpuMatcher {
         })
     }
 
-    /// Records one pass: `dispatch` gets where the reference's pixels begin in the buffers.
+    /// Records one pass: `dispatch` gets the offset of the reference's pixels in the buffers.
     fn record(&self, rec: &mut Recorder, r: &ReferenceView, dispatch: impl FnOnce(&mut Recorder, u32)) {
         let Some(view) = self.view_of(r) else { return dispatch(rec, r.first) };
         let (mut quad, mut plane) = (0, 0);
@@ -145,8 +146,7 @@ fn pixels_of(r: &ReferenceView) -> usize {
     r.width as usize * r.height as usize
 }
 
-/// Per pixel its own luma and that of the pixels to the right, below and diagonally below, 16 bits
-/// each.
+/// Luma of each pixel and of those to the right, below and diagonally below, 16 bits each.
 fn quads(luma: &[f32], references: &[ReferenceView]) -> Vec<[u32; 2]> {
     let word = |a: f32, b: f32| ((b * 65535.0).round() as u32) << 16 | (a * 65535.0).round() as u32;
     let mut out = Vec::with_capacity(luma.len());
@@ -239,8 +239,8 @@ mod tests {
         [ReferenceView { sources: 1, ..view }, ReferenceView { first: width * height, ..view }]
     }
 
-    /// The second view, at `centre` in the camera frame of the first, turned half about y or not at
-    /// all.
+    /// The second view, at `centre` in the camera frame of the first, rotated by 0° or 180° about
+    /// y.
     fn source(reference: &ReferenceView, centre: [f32; 3], turned: bool) -> SourceView {
         let [fx, fy, cx, cy] = reference.intrinsics;
         let sign = if turned { -1.0 } else { 1.0 };
@@ -258,10 +258,10 @@ mod tests {
         }
     }
 
-    /// All planes lie at depths below 1.7, none so oblique that it passes behind a camera at a
+    /// All planes lie at depths below 1.7; none is so oblique that it passes behind a camera at a
     /// depth of 8.
     #[test]
-    fn a_photo_that_sees_a_plane_from_behind_does_not_speak_for_it() {
+    fn source_behind_plane_has_maximal_cost() {
         let views = references(24, 16, 120.0, [0.6, 1.0]);
         let luma = waves(24, 16, 0.0).repeat(2);
         let costs = |source: SourceView| -> Vec<f32> {
@@ -270,16 +270,16 @@ mod tests {
             gpu.sweep(&views[0]).unwrap();
             gpu.planes().unwrap()[..24 * 16].iter().map(|p| p.w).collect()
         };
-        // What the three sources that are not there cost is 0.4 of it.
+        // The three missing sources make up 0.4 of the cost.
         let same = costs(source(&views[0], [0.0; 3], false));
         assert!(same.iter().all(|w| *w < 0.6), "{same:?}");
         let behind = costs(source(&views[0], [0.0, 0.0, 8.0], true));
         assert!(behind.iter().all(|w| (w - 1.0).abs() < 1e-5), "{behind:?}");
     }
 
-    /// A wall at the inverse depth 1.5, which every second pixel knows.
+    /// A wall at the inverse depth 1.5, the plane of every second pixel.
     #[test]
-    fn a_neighbours_plane_is_taken_over_only_where_its_depth_is_searched() {
+    fn propagation_keeps_depth_within_range() {
         let (width, height) = (32, 16);
         let taken = |nearest: f32| {
             let views = references(width, height, 20.0, [0.2, nearest]);

@@ -13,7 +13,7 @@ use crate::math::hash;
 use glam::{Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 
-// The shader's constants (glsl/shared/plane_sweep.glsl gives the reasons), in the reference's types.
+// Constants of glsl/shared/plane_sweep.glsl in the types of the reference.
 const TAPS: usize = shared::TAPS as usize;
 const NEIGHBOURS: usize = shared::SMOOTH_NEIGHBOURS as usize;
 const COST_LIMIT: f32 = shared::COST_LIMIT as f32;
@@ -23,7 +23,7 @@ const SIGMA_SPACE: f32 = shared::SIGMA_SPACE as f32;
 const SMOOTH_LIMIT: f32 = shared::SMOOTH_LIMIT as f32;
 const GEOMETRIC_LIMIT: f32 = shared::GEOMETRIC_LIMIT as f32;
 
-/// A stream of hashed numbers.
+/// Stream of hashed random numbers.
 pub struct Random(pub u32);
 
 impl Random {
@@ -41,7 +41,7 @@ impl Random {
     }
 }
 
-/// The matching window of one reference pixel: offsets are implicit, weights sum to 1.
+/// Matching window of one reference pixel: offsets are implicit, weights sum to 1.
 pub struct Window {
     /// Weight per tap.
     pub weights: [f32; TAPS * TAPS],
@@ -51,11 +51,11 @@ pub struct Window {
     pub variance: f32,
 }
 
-/// Everything a pass reads.
+/// Inputs of a pass.
 pub struct Inputs<'a> {
     /// Luma of all views, one after the other.
     pub luma: &'a [f32],
-    /// SourceView table.
+    /// Source views of all references.
     pub sources: &'a [SourceView],
     /// The reference and the search.
     pub reference: ReferenceView,
@@ -76,19 +76,19 @@ impl Inputs<'_> {
     pub fn window(&self, x: i32, y: i32) -> Window {
         let r = &self.reference;
         let image = &self.luma[r.first as usize..];
-        let at = |x: i32, y: i32| {
+        let luma_at = |x: i32, y: i32| {
             let (x, y) = (x.clamp(0, r.width as i32 - 1), y.clamp(0, r.height as i32 - 1));
             image[(y as u32 * r.width + x as u32) as usize]
         };
-        let centre = at(x, y);
+        let centre = luma_at(x, y);
         let mut weights = [0.0; TAPS * TAPS];
         let mut values = [0.0; TAPS * TAPS];
         let (mut sum, mut mean, mut square) = (0.0, 0.0, 0.0);
         for j in 0..TAPS {
             for i in 0..TAPS {
                 let (dx, dy) = (offset(i), offset(j));
-                // Relative to the centre: keeps the variance exact in f32.
-                let value = at(x + dx, y + dy) - centre;
+                // Relative to the centre, which keeps the variance exact in f32.
+                let value = luma_at(x + dx, y + dy) - centre;
                 let space = (dx * dx + dy * dy) as f32 / (2.0 * SIGMA_SPACE * SIGMA_SPACE);
                 let weight = (-value.abs() / SIGMA_COLOUR - space).exp();
                 weights[j * TAPS + i] = weight;
@@ -129,7 +129,7 @@ impl Inputs<'_> {
         let centre = apply(ray.extend(plane.dot(ray)));
         let (u, v) = (centre.x / centre.z, centre.y / centre.z);
         let inside = u >= 0.0 && v >= 0.0 && u < source.size[0] as f32 && v < source.size[1] as f32;
-        // The source must look at the same side of the plane.
+        // The source must see the same side of the plane.
         let front = plane.dot(Vec4::from(source.centre).truncate()) < 1.0;
         if !(centre.z > 0.0 && inside && front) {
             return COST_LIMIT;
@@ -195,7 +195,7 @@ impl Inputs<'_> {
             if r.geometric > 0.0 {
                 cost += r.geometric * self.geometric_error(planes, source, x, y, ray, plane);
             }
-            // Insertion into the sorted list; the last entry falls out.
+            // Insertion into the sorted list; the last entry is dropped.
             for slot in &mut best {
                 if cost < *slot {
                     std::mem::swap(slot, &mut cost);
@@ -205,12 +205,12 @@ impl Inputs<'_> {
         (0..MAX_SOURCES).map(|k| shared::VIEW_SHARES[k] as f32 * best[k]).sum()
     }
 
-    /// A plane through `1/z = inverse_depth` at the pixel with a given normal, or None if it is
-    /// seen too obliquely or lies outside the searched range.
+    /// Plane through `1/z = inverse_depth` at the pixel with a given normal; `None` if it is seen
+    /// too obliquely or lies outside the searched range.
     pub fn plane(&self, ray: Vec3, normal: Vec3, inverse_depth: f32) -> Option<Vec3> {
         let slope = normal.dot(ray);
         let [near, far] = [self.reference.range[1], self.reference.range[0]];
-        // cos 84°: a window foreshortened tenfold matches nothing.
+        // cos 84°: a window foreshortened tenfold has no matches.
         let visible = slope < -0.1 * normal.length() * ray.length();
         (visible && inverse_depth >= far && inverse_depth <= near).then(|| normal * (inverse_depth / slope))
     }
@@ -221,9 +221,8 @@ impl Inputs<'_> {
         Random(hash(r.seed ^ hash(r.first + y as u32 * r.width + x as u32)))
     }
 
-    /// The initial sweep at one pixel: `planes` inverse depths over the range, jittered, each with
-    /// a random normal (cosine-weighted about the viewing ray). Returns the best plane and its
-    /// cost.
+    /// Initial sweep at one pixel: `planes` inverse depths over the range, jittered, each with a
+    /// random normal (cosine-weighted about the viewing ray). Returns the best plane and its cost.
     pub fn sweep(&self, x: i32, y: i32) -> Vec4 {
         let r = &self.reference;
         let ray = self.ray(x, y);
@@ -244,7 +243,7 @@ impl Inputs<'_> {
         best
     }
 
-    /// Inverse depth and weight of the neighbours of a pixel: (offset, inverse depth, weight).
+    /// Neighbours of the smoothness term of a pixel: (offset, inverse depth, weight).
     fn neighbours(&self, own: &[Vec4], x: i32, y: i32) -> [([i32; 2], f32, f32); NEIGHBOURS] {
         let r = &self.reference;
         let luma = |x: i32, y: i32| self.luma[(r.first + y as u32 * r.width + x as u32) as usize];
@@ -263,13 +262,13 @@ impl Inputs<'_> {
         })
     }
 
-    /// How badly a plane continues into the neighbours' surfaces.
+    /// Smoothness term: weighted differences of inverse depth between a plane and the neighbours.
     fn roughness(&self, near: &[([i32; 2], f32, f32); NEIGHBOURS], x: i32, y: i32, plane: Vec3) -> f32 {
-        let one = |&([dx, dy], inverse, weight): &([i32; 2], f32, f32)| {
-            let there = plane.dot(self.ray(x + dx, y + dy));
-            weight * ((there - inverse).abs() / (SMOOTH_LIMIT * inverse.max(1e-9))).min(1.0)
+        let difference = |&([dx, dy], inverse, weight): &([i32; 2], f32, f32)| {
+            let extended = plane.dot(self.ray(x + dx, y + dy));
+            weight * ((extended - inverse).abs() / (SMOOTH_LIMIT * inverse.max(1e-9))).min(1.0)
         };
-        near.iter().map(one).sum()
+        near.iter().map(difference).sum()
     }
 
     /// One propagation and refinement step at one pixel. `planes` holds (π, cost) of all views.
@@ -283,7 +282,7 @@ impl Inputs<'_> {
             |plane: Vec3| self.cost(planes, &window, x, y, ray, plane) + self.roughness(&near, x, y, plane);
         let mut random = self.random(x, y);
         let current = own[(y as u32 * r.width + x as u32) as usize];
-        // Re-evaluated: after a change of resolution or of the other views its stored cost is
+        // Re-evaluated, since a change of resolution or of the other views makes the stored cost
         // stale.
         let cost = total(current.truncate());
         let mut best = current.truncate().extend(cost);
@@ -327,9 +326,9 @@ impl Inputs<'_> {
         best
     }
 
-    /// The plane with the lowest cost in one of eight areas around a pixel (0–3: a near wedge per
-    /// direction, 4–7: a far strip per direction), all of the other checkerboard colour; None
-    /// outside the image.
+    /// Plane with the lowest cost in one of eight areas around a pixel (0–3: a near wedge per
+    /// direction, 4–7: a far strip per direction), all of the other checkerboard colour; `None`
+    /// where the area is outside the image.
     pub fn area_best(&self, own: &[Vec4], x: i32, y: i32, area: usize) -> Option<Vec3> {
         let r = &self.reference;
         let (dx, dy) = [(1, 0), (-1, 0), (0, 1), (0, -1)][area % 4];
@@ -357,7 +356,7 @@ impl Inputs<'_> {
     }
 }
 
-/// The reference of the whole GPU matcher: same calls, plain loops.
+/// CPU reference of the GPU matcher.
 pub struct CpuMatcher {
     luma: Vec<f32>,
     sources: Vec<SourceView>,
@@ -365,7 +364,7 @@ pub struct CpuMatcher {
 }
 
 impl CpuMatcher {
-    /// `luma` and `planes` (π, cost) hold all views one after the other.
+    /// Takes `luma` and `planes` (π, cost) of all views, one after the other.
     pub fn new(luma: Vec<f32>, sources: Vec<SourceView>, planes: Vec<Vec4>) -> Self {
         CpuMatcher { luma, sources, planes }
     }

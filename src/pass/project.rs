@@ -18,8 +18,8 @@ use crate::gpu::{Buffer, Recorder, shaders};
 use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
-/// Records the projection of all splats, with the first (sh_degree + 1)² coefficients, to
-/// `frame.projected` and `frame.depth_pairs`.
+/// Records the projection of all splats to `frame.projected` and `frame.depth_pairs`, with the
+/// first (sh_degree + 1)² SH coefficients.
 pub fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,
@@ -49,7 +49,8 @@ pub fn record(
     rec.dispatch_threads(call, [count, 1, 1]);
 }
 
-/// Records the change from stored to rendered features, `frame.codes`. Nothing without features.
+/// Records the map from stored to rendered features, `frame.codes`. Records nothing without
+/// features.
 pub fn record_features(rec: &mut Recorder, splats: &SplatBuffers, frame: &FrameBuffers, mode: FeatureMode) {
     if splats.feature_dim == 0 {
         return;
@@ -68,7 +69,7 @@ pub fn record_features(rec: &mut Recorder, splats: &SplatBuffers, frame: &FrameB
     rec.dispatch_threads(call, [count, 1, 1]);
 }
 
-/// A splat on the screen, f64 reference.
+/// Projected splat, f64 reference.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Projected {
     /// Centre in index coordinates (centre of the first pixel = 0), pixels.
@@ -83,7 +84,7 @@ pub struct Projected {
     pub colour: DVec3,
 }
 
-/// What forward and backward both need of the geometry of one splat.
+/// Geometry of one splat, shared by forward and backward pass.
 #[derive(Clone, Debug)]
 pub(super) struct Geometry {
     pub t: DVec3,
@@ -112,7 +113,7 @@ pub(super) struct Geometry {
 /// R_q of a unit quaternion (w, x, y, z).
 pub fn rotation_of(q: DVec4) -> DMat3 {
     let (r, x, y, z) = (q.x, q.y, q.z, q.w);
-    // glam wants columns; each line below is one column.
+    // Each line below is one column.
     DMat3::from_cols(
         DVec3::new(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + r * z), 2.0 * (x * z - r * y)),
         DVec3::new(2.0 * (x * y - r * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + r * x)),
@@ -120,7 +121,7 @@ pub fn rotation_of(q: DVec4) -> DMat3 {
     )
 }
 
-/// `None` when the splat is not in front of the near plane.
+/// Geometry of splat `i`; `None` where it is not beyond the near plane.
 pub(super) fn geometry(params: &Params, i: usize, view: &View) -> Option<Geometry> {
     let t = view.rotation * params.means[i] + view.translation;
     if t.z <= view.near {
@@ -166,8 +167,8 @@ pub(super) fn geometry(params: &Params, i: usize, view: &View) -> Option<Geometr
     })
 }
 
-/// Projects splat `i`; `None` when it is behind the near plane or its opacity is below `alpha_min`,
-/// where it can change no pixel.
+/// Projects splat `i`; `None` where it is not beyond the near plane, or its opacity is below
+/// `alpha_min` and it can change no pixel.
 pub fn reference(params: &Params, i: usize, view: &View, alpha_min: f64) -> Option<Projected> {
     let g = geometry(params, i, view)?;
     let own = 1.0 / (1.0 + (-params.opacity_logits[i]).exp());
@@ -193,7 +194,8 @@ pub(super) fn raw_colour(params: &Params, i: usize, view: &View) -> DVec3 {
     params.sh_of(i).iter().zip(basis).map(|(&c, b)| c * b).sum()
 }
 
-/// Raw features [N, d] → rendered ones (docs/internals/method.md#feature-gauge).
+/// CPU reference of the map from raw to rendered features, [N, d]
+/// (docs/internals/method.md#feature-gauge).
 pub fn features_reference(features: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
     match mode {
         FeatureMode::Linear => features.to_vec(),

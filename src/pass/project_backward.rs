@@ -1,4 +1,4 @@
-//! Gradients of the raw parameters and of the camera from those of the screen-space splats
+//! Gradients by the raw parameters and by the camera from those by the screen-space splats
 //! (docs/internals/method.md#backward-rasterisation).
 //!
 //! With Q the conic matrix and G_M = [[∂A, ½∂B], [½∂B, ∂C]]: `G' = −Q G_M Q`, `∂B = 2 G' B` (2×3),
@@ -17,15 +17,15 @@ use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
-/// Workgroups that share the splats, each of which leaves a part of the camera gradient: as many as
-/// fill a large GPU (a hundred thousand threads), or as a few cores begin quickly.
+/// Number of workgroups, each with a partial camera gradient: enough to fill a large GPU (a hundred
+/// thousand threads), or few enough to start quickly on a few cores.
 pub(super) fn groups(device: &Device, splats: usize) -> u32 {
     let most = if device.info().is_cpu { 64 } else { 2048 };
     splats.div_ceil(shaders::project_backward::WORKGROUP[0] as usize).clamp(1, most) as u32
 }
 
-/// Records the gradients by all raw parameters (overwritten in `gradients`, zero where a splat was
-/// not seen) and by the camera (`camera_grad` [10]: ρ, θ, fx, fy, cx, cy).
+/// Records the gradients by all raw parameters (overwrites `gradients`; zero for splats without
+/// pixels) and by the camera (`camera_grad` [10]: ρ, θ, fx, fy, cx, cy).
 pub fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,
@@ -68,7 +68,7 @@ pub fn record(
     rec.dispatch(call, [CAMERA_GRADIENTS as u32, 1, 1]);
 }
 
-/// Records the gradient by the stored features. Nothing without features.
+/// Records the gradient by the stored features. Records nothing without features.
 pub fn record_features(
     rec: &mut Recorder,
     splats: &SplatBuffers,
@@ -97,7 +97,7 @@ pub fn record_features(
     rec.dispatch_threads(call, [count, 1, 1]);
 }
 
-/// Adds what flows back through splat `i` (which must be visible) to `out`.
+/// CPU reference: adds the gradients through splat `i`, which must be visible, to `out`.
 pub fn reference(params: &Params, i: usize, view: &View, upstream: &SplatGradient, out: &mut Gradients) {
     let Some(g) = geometry(params, i, view) else { return };
     let [m0, m1, m2, m3, m4, m5] = upstream.moments;
@@ -146,8 +146,8 @@ pub fn reference(params: &Params, i: usize, view: &View, upstream: &SplatGradien
     }
 }
 
-/// In the clamped branch the limit itself depends on the focal length and the principal point:
-/// l⁺ = (W − c + 0.15 W)/f, −l⁻ = −(c + 0.15 W)/f, so that t̃ = ±l z. Returns (∂f, ∂c).
+/// Gradient (∂f, ∂c) through the limit of the clamped branch, which depends on the focal length and
+/// the principal point: l⁺ = (W − c + 0.15 W)/f, −l⁻ = −(c + 0.15 W)/f, so that t̃ = ±l z.
 fn clamp_limit_backward(g: &Geometry, view: &View, axis: usize, by_j2: f64) -> (f64, f64) {
     if g.inside[axis] {
         return (0.0, 0.0);
@@ -159,7 +159,7 @@ fn clamp_limit_backward(g: &Geometry, view: &View, axis: usize, by_j2: f64) -> (
     (by_limit * (-limit / focal), by_limit * (-1.0 / focal))
 }
 
-/// ∂(A, B, C) → ∂B (rows), through Σ'⁻¹ and Σ' = B Bᵀ + 0.3 I.
+/// ∂B (rows) from ∂(A, B, C), through Σ'⁻¹ and Σ' = B Bᵀ + 0.3 I.
 fn covariance_backward(g: &Geometry, by_conic: [f64; 3]) -> [DVec3; 2] {
     let [a, b, c] = g.conic;
     let (ga, gb, gc) = (by_conic[0], 0.5 * by_conic[1], by_conic[2]);
@@ -197,7 +197,7 @@ fn camera_point_backward(
     by_t
 }
 
-/// ∂M → log scales and raw quaternion.
+/// Adds the gradients by log scales and raw quaternion, from ∂M.
 fn shape_backward(g: &Geometry, by_m: DMat3, i: usize, out: &mut Gradients) {
     for k in 0..3 {
         out.params.log_scales[i][k] += g.scale[k] * g.rotation.col(k).dot(by_m.col(k));
@@ -218,8 +218,8 @@ fn shape_backward(g: &Geometry, by_m: DMat3, i: usize, out: &mut Gradients) {
     out.params.quats[i] += (by_unit - g.quat * g.quat.dot(by_unit)) / g.quat_length;
 }
 
-/// ∂RGB → SH coefficients; returns what reaches the mean through the viewing direction (world
-/// axes).
+/// Adds the gradient by the SH coefficients, from ∂RGB; returns the gradient by the mean through
+/// the viewing direction, world axes.
 fn colour_backward(
     params: &Params,
     i: usize,
@@ -252,8 +252,9 @@ fn outer(a: DVec3, b: DVec3) -> DMat3 {
     DMat3::from_cols(a * b.x, a * b.y, a * b.z)
 }
 
-/// ∂(rendered features) → ∂(raw features), both [N, d] (docs/internals/method.md#feature-gauge):
-/// `∂f = (∂f̂ − f̂'(f̂'·∂f̂)·‖f‖/(‖f‖+ε)) / (‖f‖+ε)` with f̂' = f/‖f‖.
+/// CPU reference of the gradient by raw features from that by rendered ones, both [N, d]
+/// (docs/internals/method.md#feature-gauge): `∂f = (∂f̂ − f̂'(f̂'·∂f̂)·‖f‖/(‖f‖+ε)) / (‖f‖+ε)` with
+/// f̂' = f/‖f‖.
 pub fn features_reference(features: &[f64], upstream: &[f64], dim: usize, mode: FeatureMode) -> Vec<f64> {
     let FeatureMode::Gauge { epsilon, .. } = mode else { return upstream.to_vec() };
     let mut out = Vec::with_capacity(upstream.len());

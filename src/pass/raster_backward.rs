@@ -1,11 +1,11 @@
-//! Gradients of the blended image by every screen-space splat
+//! Gradients through the blending by every screen-space splat
 //! (docs/internals/method.md#backward-rasterisation).
 //!
 //! Upstream planes [(4 + d) + 1, H, W]: ∂L/∂(RGB on background), ∂L/∂Σwz, ∂L/∂features, ∂L/∂alpha
 //! (alpha = 1 − T_f). For a contributor with w = αT, own = c·g: `∂c += w g`, `∂α = T own − (S − g_A
 //! T_f)/(1 − α)` with S the weighted upstream sum of everything behind it, background included. The
-//! pass walks front to back and gets S as (pixel total) − (what it has already passed), so that T
-//! needs no division and no list of contributors.
+//! pass walks front to back and computes S as the total of the pixel minus the sum up to here, so
+//! that T needs no division and no list of contributors.
 //!
 //! With σ = ∂α · α (0 where α was clamped), the shader only sums six moments: Σσ, Σσdx, Σσdy,
 //! Σσdx², Σσdxdy, Σσdy². Every geometry gradient follows per splat: ∂o = m₀/o, ∂(u, v) = −(A m₁ + B
@@ -18,6 +18,7 @@ use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Moments of one splat in the gradient buffer; RGB and z follow.
 pub const MOMENTS: usize = shaders::shared::layout::MOMENTS as usize;
+
 /// Clears the sums that [`record`] adds to.
 pub(super) fn record_clear(rec: &mut Recorder, frame: &FrameBuffers) {
     rec.fill(&frame.projected_grad, 0);
@@ -26,11 +27,11 @@ pub(super) fn record_clear(rec: &mut Recorder, frame: &FrameBuffers) {
     }
 }
 
-/// Records the way from `frame.planes_grad` to `frame.projected_grad` and `frame.codes_grad` of
-/// `count` splats, for some rows of tiles, whose lists are there. Adds to what [`record_clear`]
-/// cleared; where these are `all` tiles of the image, sums by entries need no clearing.
-/// `features_move_geometry` = false keeps the features' part of the loss away from everything but
-/// the features.
+/// Records the back-propagation of `frame.planes_grad` to `frame.projected_grad` and
+/// `frame.codes_grad` of `count` splats, for rows of tiles with present lists. Adds to the sums
+/// that [`record_clear`] cleared; [`GradientReduction::Entries`] overwrites them where these are
+/// `all` tiles of the image. `features_move_geometry` = false restricts the gradient of the feature
+/// planes to the features.
 pub(super) fn record(
     rec: &mut Recorder,
     frame: &FrameBuffers,
@@ -40,39 +41,45 @@ pub(super) fn record(
     all: bool,
 ) {
     let coupling = if features_move_geometry { 1.0 } else { 0.0 };
-    let blocks = blocks(frame.feature_dim as u32);
     match frame.summation {
         GradientReduction::Atomics => {
-            for block in blocks {
+            for block in blocks(frame.feature_dim as u32) {
                 record_atomic(rec, frame, tiles, block, coupling);
             }
         }
         GradientReduction::Entries => match frame.gradient_entries.buffers(rec.device(), frame) {
-            Ok(entries) => {
-                let sum = |rec: &mut Recorder, from, to, columns| {
-                    record_sum(rec, frame, count, from, to, columns, !all);
-                };
-                for block in blocks {
-                    record_entries(rec, frame, tiles, &entries, block, coupling);
-                    if block.features > 0 {
-                        // No more vectors than there are: behind a splat's last one the next splat
-                        // begins.
-                        let columns = Columns {
-                            width: block.vectors(),
-                            vectors: block.features.div_ceil(4),
-                            stride: frame.code_stride() / 4,
-                            first_vector: block.first_vector,
-                        };
-                        sum(rec, &entries.codes, &frame.codes_grad, columns);
-                    }
-                }
-                let vectors = GRADIENT_FLOATS as u32 / 4;
-                let columns = Columns { width: vectors, vectors, stride: vectors, first_vector: 0 };
-                sum(rec, &entries.splats, &frame.projected_grad, columns);
-            }
+            Ok(entries) => record_stored(rec, frame, tiles, &entries, count, coupling, !all),
             Err(e) => rec.fail_with(e),
         },
     }
+}
+
+/// Records [`GradientReduction::Entries`]: all blocks of channels, each summed per splat.
+fn record_stored(
+    rec: &mut Recorder,
+    frame: &FrameBuffers,
+    tiles: &Tiles,
+    entries: &EntryBuffers,
+    count: usize,
+    coupling: f32,
+    add: bool,
+) {
+    for block in blocks(frame.feature_dim as u32) {
+        record_entries(rec, frame, tiles, entries, block, coupling);
+        if block.features > 0 {
+            // Only the vectors of the block: a write behind them would hit the next splat.
+            let columns = Columns {
+                width: block.vectors(),
+                vectors: block.features.div_ceil(4),
+                stride: frame.code_stride() / 4,
+                first_vector: block.first_vector,
+            };
+            record_sum(rec, frame, count, &entries.codes, &frame.codes_grad, columns, add);
+        }
+    }
+    let vectors = GRADIENT_FLOATS as u32 / 4;
+    let columns = Columns { width: vectors, vectors, stride: vectors, first_vector: 0 };
+    record_sum(rec, frame, count, &entries.splats, &frame.projected_grad, columns, add);
 }
 
 fn record_atomic(rec: &mut Recorder, frame: &FrameBuffers, tiles: &Tiles, block: Block, coupling: f32) {
@@ -120,22 +127,24 @@ fn record_entries(
     rec.dispatch(call, [frame.tiles()[0], tiles.rows.len() as u32, 1]);
 }
 
-/// Where the alpha plane lies in the stack.
+/// Index of the alpha plane in the stack.
 fn alpha_plane(frame: &FrameBuffers) -> u32 {
     (BASE_CHANNELS + frame.feature_dim) as u32
 }
 
-/// Where the columns of [`record_sum`] go, in vectors of four.
+/// Columns of [`record_sum`], in vectors of four.
 struct Columns {
-    /// Of an entry.
+    /// Vectors of an entry.
     width: u32,
-    /// Of these, the first that are summed.
+    /// Number of its first vectors that are summed.
     vectors: u32,
+    /// Vectors of a splat in the sums.
     stride: u32,
+    /// First vector of a splat to write.
     first_vector: u32,
 }
 
-/// The sums of `from` [entries, width] per splat, written or `add`ed to columns of `to` [N,
+/// Records the sums of `from` [entries, width] per splat, written or `add`ed to columns of `to` [N,
 /// stride].
 fn record_sum(
     rec: &mut Recorder,
@@ -168,7 +177,7 @@ fn record_sum(
     rec.dispatch(call, rows_of_groups(count * vectors as usize));
 }
 
-/// What flows back to one splat, in the layout of the GPU gradient buffer.
+/// Gradient by one screen-space splat, in the layout of the GPU buffer.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SplatGradient {
     /// Σσ, Σσdx, Σσdy, Σσdx², Σσdxdy, Σσdy².
@@ -177,7 +186,7 @@ pub struct SplatGradient {
     pub channels: [f64; BASE_CHANNELS],
 }
 
-/// Gradients by all splats on the screen.
+/// Gradients by all screen-space splats.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ScreenGradients {
     /// [N].
@@ -186,7 +195,7 @@ pub struct ScreenGradients {
     pub features: Vec<f64>,
 }
 
-/// Back-propagates `upstream` [(4 + d) + 1, H, W].
+/// CPU reference: back-propagates `upstream` [(4 + d) + 1, H, W].
 pub fn reference(scene: &ReferenceScene, cutoffs: &Cutoffs, upstream: &[f64]) -> ScreenGradients {
     let [width, height] = scene.view.size;
     let pixels = width as usize * height as usize;

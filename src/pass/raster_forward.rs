@@ -15,7 +15,7 @@ use crate::gpu::{Buffer, Recorder, shaders};
 
 pub use super::channels::BASE_CHANNELS;
 
-/// The push constants of a raster shader; what only some of them have goes behind.
+/// Push constants of a raster shader, followed by fields that only some have.
 macro_rules! push {
     ($shader:ident, $frame:expr, $tiles:expr, $block:expr $(, $field:ident: $value:expr)*) => {
         shaders::$shader::Push {
@@ -35,7 +35,7 @@ macro_rules! push {
 }
 pub(super) use push;
 
-/// Records the blending of the binned splats into `frame.planes` and `frame.transmittance`.
+/// Records the blending of the listed splats into `frame.planes` and `frame.transmittance`.
 pub(super) fn record(rec: &mut Recorder, camera: &Buffer<CameraView>, frame: &FrameBuffers, tiles: &Tiles) {
     for block in blocks(frame.feature_dim as u32) {
         let call = shaders::raster_forward::call(
@@ -55,26 +55,26 @@ pub(super) fn record(rec: &mut Recorder, camera: &Buffer<CameraView>, frame: &Fr
     }
 }
 
-/// The discontinuities of the blending rule. Tests that take finite differences switch them off.
+/// Thresholds of the blending rule. Tests with finite differences disable its discontinuities.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cutoffs {
-    /// A contribution below this is skipped.
+    /// Contributions with a lower α are skipped.
     pub alpha_min: f64,
-    /// α is clamped here, so that T never reaches 0.
+    /// Upper bound of α, so that T never reaches 0.
     pub alpha_max: f64,
     /// A pixel stops before T would fall below this.
     pub transmittance_min: f64,
 }
 
 impl Cutoffs {
-    /// The values every 3DGS renderer uses, and the shaders here.
+    /// Values of every 3DGS renderer and of the shaders here.
     pub const STANDARD: Cutoffs =
         Cutoffs { alpha_min: ALPHA_MIN, alpha_max: ALPHA_MAX, transmittance_min: TRANSMITTANCE_MIN };
-    /// Without the two jumps (the α clamp is continuous and stays).
+    /// Without the two discontinuities; the α clamp is continuous and stays.
     pub const SMOOTH: Cutoffs = Cutoffs { alpha_min: 0.0, alpha_max: ALPHA_MAX, transmittance_min: 0.0 };
 }
 
-/// What the raster references read.
+/// Inputs of the raster references.
 pub struct ReferenceScene<'a> {
     /// [N].
     pub projected: &'a [Option<Projected>],
@@ -82,7 +82,7 @@ pub struct ReferenceScene<'a> {
     pub features: &'a [f64],
     /// d.
     pub feature_dim: usize,
-    /// Nearest first.
+    /// Indices of splats, nearest first.
     pub order: &'a [u32],
     /// Size and background.
     pub view: &'a View,
@@ -149,7 +149,7 @@ pub(super) fn channels_of(scene: &ReferenceScene, splat: usize) -> Vec<f64> {
     values
 }
 
-/// Renders by walking all splats at every pixel.
+/// CPU reference: walks all splats at every pixel.
 pub fn reference(scene: &ReferenceScene, cutoffs: &Cutoffs) -> RenderedImage {
     let [width, height] = scene.view.size;
     let pixels = width as usize * height as usize;

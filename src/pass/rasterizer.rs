@@ -1,17 +1,19 @@
-//! The training-facing render: parameters and gradients in GPU buffers, forward and backward as
-//! recorded commands.
+//! Differentiable rasteriser for training: parameters and gradients in GPU buffers, forward and
+//! backward pass as recorded commands.
 //!
 //! ```no_run
-//! # use splatvk::{gpu::{self, Recorder}, pass::rasterizer::*, pass::view::View, scene::{Camera, Splats}};
+//! # use splatvk::gpu::{self, Recorder};
+//! # use splatvk::{pass::rasterizer::*, pass::view::View, scene::{Camera, Splats}};
 //! # fn step(splats: &Splats, camera: &Camera) -> splatvk::Result<()> {
 //! let device = gpu::open(None)?;
 //! let params = SplatBuffers::upload(&device, splats, &[], 0)?;
 //! let grads = params.zeros_like(&device)?;
-//! let mut raster = Rasterizer::new(&device, params.count, params.feature_dim, camera.width, camera.height)?;
+//! let (count, dim) = (params.count, params.feature_dim);
+//! let mut raster = Rasterizer::new(&device, count, dim, camera.width, camera.height)?;
 //! let options = RasterOptions::default();
 //!
 //! raster.set_view(&View::new(camera, 0.02))?;
-//! raster.forward(&params, &options)?;               // runs; grows its lists and repeats if they were too short
+//! raster.forward(&params, &options)?; // grows lists that are too short and repeats
 //! let mut rec = Recorder::new(&device, "step");
 //! // … a loss pass reads raster.frame().planes and writes raster.frame().planes_grad …
 //! raster.record_backward(&mut rec, &params, &options, &grads);
@@ -24,13 +26,13 @@
 //!
 //! A whole step may also be one [`crate::gpu::Program`]: [`Rasterizer::record_forward`], loss,
 //! [`Rasterizer::record_backward`], optimiser. It can be run again for other views after
-//! [`Rasterizer::set_view`]. Then check [`Rasterizer::overflow`] after each run: if the lists did
-//! not fit, that step saw an image without any splats; call [`Rasterizer::grow`], record again and
-//! repeat the step (an optimiser pass can read `frame().status[1]` on the GPU and do nothing when
-//! it is not 0).
+//! [`Rasterizer::set_view`]. Check [`Rasterizer::overflow`] after each run: if the lists did not
+//! fit, the step rendered an image without splats; call [`Rasterizer::grow`], record again and
+//! repeat the step. An optimiser pass reads `frame().status[1]` on the GPU and skips the step when
+//! it is not 0.
 //!
-//! Recordings hold the buffers they were made with: record again after `grow`, after changing the
-//! number of splats, the SH degree or the options.
+//! Recordings hold their buffers: record again after `grow` and after a change of the number of
+//! splats, the SH degree or the options.
 //!
 //! An image that is too large for the device is rendered in bands ([`super::bands`]), one after the
 //! other in the same planes: [`Rasterizer::record_projection`], then for every band
@@ -55,24 +57,24 @@ pub use super::frame::FrameBuffers;
 pub use super::options::RasterOptions;
 pub use super::splat_buffers::SplatBuffers;
 
-/// Choices among passes that lead to the same result.
+/// Choices among kernel variants that compute the same.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct DeviceChoices {
-    /// How tile lists are made.
+    /// Binning of the tile lists.
     pub grouping: TileBinning,
-    /// How gradients of several tiles are added up.
+    /// Reduction of the gradients over tiles.
     pub summation: GradientReduction,
 }
 
 impl DeviceChoices {
-    /// What suits the device.
+    /// Fastest choices for the device.
     pub fn of(device: &Device) -> DeviceChoices {
         DeviceChoices { grouping: TileBinning::of(device), summation: GradientReduction::of(device) }
     }
 }
 
-/// Entries that the device takes at once, with the gradients that some ways of adding up keep for
-/// each.
+/// Most tile-list entries that the device holds at once, including the gradients per entry of
+/// [`GradientReduction::Entries`].
 fn most_entries(
     device: &Device,
     (grouping, tiles): (TileBinning, usize),
@@ -86,23 +88,26 @@ fn most_entries(
     tile_lists::most_entries(device, grouping, tiles).min(gradients)
 }
 
-/// Renders up to N splats with d features at a fixed image size, and back.
+/// Renders up to N splats with d features at a fixed image size, and back-propagates gradients.
 pub struct Rasterizer {
     device: Device,
     capacity: usize,
     camera: Buffer<CameraView>,
     frame: FrameBuffers,
     grouping: TileBinning,
-    /// Rows of tiles whose lists are made at once.
+    /// Rows of tiles that are binned at once.
     strip: u32,
     sort: Sort,
-    /// [1] u32: N, where the sort reads it.
+    /// [1] u32: N, read by the sort.
     count: Buffer<u32>,
 }
 
 impl Rasterizer {
-    /// Room for `capacity` splats with `feature_dim` features (0, or as the splats have), images of
-    /// width × height.
+    /// Allocates for `capacity` splats with `feature_dim` features (0 or that of the splats) and
+    /// images of width × height pixels.
+    ///
+    /// # Errors
+    /// Where the size is zero, or the image is too wide for the device.
     pub fn new(
         device: &Device,
         capacity: usize,
@@ -113,14 +118,14 @@ impl Rasterizer {
         Rasterizer::with(device, capacity, feature_dim, width, height, DeviceChoices::of(device))
     }
 
-    /// [`Rasterizer::new`] with ways that may not be the device's best: for tests and benchmarks.
+    /// [`Rasterizer::new`] with given choices, for tests and benchmarks.
     pub fn with(
         device: &Device,
         capacity: usize,
         feature_dim: usize,
         width: u32,
         height: u32,
-        ways: DeviceChoices,
+        choices: DeviceChoices,
     ) -> Result<Rasterizer> {
         if width == 0 || height == 0 {
             return Err(Error::work("an image of zero size cannot be rendered"));
@@ -131,9 +136,9 @@ impl Rasterizer {
         let tiles = width.div_ceil(TILE) as usize * strip as usize;
         let splats = capacity.max(1);
         let stride = feature_dim.next_multiple_of(4);
-        // About five entries per splat on the seeded scene; `forward` grows the list if that is too
-        // few.
-        let most = most_entries(device, (ways.grouping, tiles), ways.summation, feature_dim);
+        // About five entries per splat on the seeded scene; `forward` grows lists that are too
+        // short.
+        let most = most_entries(device, (choices.grouping, tiles), choices.summation, feature_dim);
         let entries = (8 * splats + 4 * tiles).min(most);
         let frame = FrameBuffers {
             width,
@@ -151,12 +156,12 @@ impl Rasterizer {
                 "camera_parts",
                 CAMERA_GRADIENTS * project_backward::groups(device, splats) as usize,
             )?,
-            summation: ways.summation,
+            summation: choices.summation,
             gradient_entries: GradientEntries::default(),
             codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
             codes_grad: device.buffer::<f32>("codes_grad", (stride * splats).max(4))?,
             depth_pairs: device.buffer::<u32>("depth_pairs", 2 * splats)?,
-            lists: TileLists::new(device, ways.grouping, splats, tiles, entries)?,
+            lists: TileLists::new(device, choices.grouping, splats, tiles, entries)?,
         };
         let camera = device.buffer::<CameraView>("camera", 1)?;
         let sort = Sort::new(device, splats)?;
@@ -166,24 +171,24 @@ impl Rasterizer {
             capacity,
             camera,
             frame,
-            grouping: ways.grouping,
+            grouping: choices.grouping,
             strip,
             sort,
             count,
         })
     }
 
-    /// The output and gradient planes.
+    /// Output and gradient planes.
     pub fn frame(&self) -> &FrameBuffers {
         &self.frame
     }
 
-    /// One [`CameraView`]: what later runs of any recording render.
+    /// Camera of later runs of any recording, one [`CameraView`].
     pub fn camera(&self) -> &Buffer<CameraView> {
         &self.camera
     }
 
-    /// Chooses the view that later runs render.
+    /// Sets the view of later runs.
     pub fn set_view(&self, view: &View) -> Result<()> {
         if view.size != [self.frame.width, self.frame.height] {
             return Err(Error::work(format!(
@@ -201,9 +206,9 @@ impl Rasterizer {
         self.record_band(rec, params, &self.frame.bands.get(0));
     }
 
-    /// Records the way back from `frame().planes_grad` to `gradients` (overwritten; zero for unseen
-    /// splats) and `frame().camera_grad`. Needs the results of a forward pass with the same
-    /// parameters, view and options.
+    /// Records the backward pass from `frame().planes_grad` to `gradients` (overwritten; zero for
+    /// splats without pixels) and `frame().camera_grad`. Needs the results of a forward pass with
+    /// the same parameters, view and options.
     pub fn record_backward(
         &self,
         rec: &mut Recorder,
@@ -230,7 +235,7 @@ impl Rasterizer {
         project::record(rec, params, &self.camera, &self.frame, sh_degree);
         project::record_features(rec, params, &self.frame, options.feature_mode);
         rec.pass("depth sort");
-        // Keys are the bits of camera z. The sort is stable, so equal depths keep the order of the
+        // Keys are the bits of camera z. The sort is stable: equal depths keep the order of the
         // splats.
         rec.fill(&self.count, params.count as u32);
         self.sort.record(rec, &self.frame.depth_pairs, &self.count, 32);
@@ -245,8 +250,8 @@ impl Rasterizer {
         }
     }
 
-    /// Records the way back from `frame().planes_grad` of the band that was blended last to the
-    /// splats on the screen: the first band overwrites, the others add.
+    /// Records the backward pass from `frame().planes_grad` of the band that was blended last to
+    /// the screen-space splats: the first band overwrites their gradients, the others add to them.
     pub fn record_band_backward(
         &self,
         rec: &mut Recorder,
@@ -255,34 +260,38 @@ impl Rasterizer {
         band: &Band,
     ) {
         rec.pass("raster backward");
-        let listed = self.strips(band, band.top..band.top + band.rows);
-        let all = self.frame.bands.count() == 1 && listed.len() == 1;
-        if band.index == 0 && !(all && self.frame.summation == GradientReduction::Entries) {
-            raster_backward::record_clear(rec, &self.frame);
-        }
+        let coupled = options.features_move_geometry;
+        let by_entries = self.frame.summation == GradientReduction::Entries;
+        let stored = self.strips(band, band.top..band.top + band.rows);
         let inner = self.strips(band, band.inner.clone());
-        let strips = match listed.as_slice() {
-            // The lists are still there. Sums by entries read every entry, so that the halo writes
-            // its zeros.
-            [one] if self.frame.summation == GradientReduction::Entries => vec![one.clone()],
-            [one] => {
-                let rows = inner.first().map_or(0, |t| t.rows.start)..inner.last().map_or(0, |t| t.rows.end);
-                vec![Tiles { rows, ..*one }]
+        // The lists of the forward pass hold its last strip: several strips are binned again.
+        let [only] = stored.as_slice() else {
+            if band.index == 0 {
+                raster_backward::record_clear(rec, &self.frame);
             }
-            _ => inner,
-        };
-        for tiles in strips {
-            if listed.len() > 1 {
+            for tiles in inner {
                 self.record_lists(rec, params, &tiles);
                 rec.pass("raster backward");
+                raster_backward::record(rec, &self.frame, &tiles, params.count, coupled, false);
             }
-            let coupled = options.features_move_geometry;
-            raster_backward::record(rec, &self.frame, &tiles, params.count, coupled, all);
+            return;
+        };
+        let all = self.frame.bands.count() == 1;
+        if band.index == 0 && !(all && by_entries) {
+            raster_backward::record_clear(rec, &self.frame);
         }
+        let tiles = if by_entries {
+            // Every stored entry is summed, so the halo must store its zeros.
+            only.clone()
+        } else {
+            let rows = inner.first().map_or(0, |t| t.rows.start)..inner.last().map_or(0, |t| t.rows.end);
+            Tiles { rows, ..*only }
+        };
+        raster_backward::record(rec, &self.frame, &tiles, params.count, coupled, all);
     }
 
-    /// Records the rest of the way, from the splats on the screen to `gradients` (overwritten; zero
-    /// for unseen splats) and `frame().camera_grad`.
+    /// Records the backward pass from the screen-space splats to `gradients` (overwritten; zero for
+    /// splats without pixels) and `frame().camera_grad`.
     pub fn record_gradients(
         &self,
         rec: &mut Recorder,
@@ -302,7 +311,7 @@ impl Rasterizer {
         bin::record(rec, &self.frame, &tiles.rows, params.count, &self.count);
     }
 
-    /// Some rows of pixels of a band as rows of tiles, as many at once as have room in the lists.
+    /// Divides rows of pixels of a band into strips of tiles that are binned at once.
     fn strips(&self, band: &Band, pixels: Range<usize>) -> Vec<Tiles> {
         let rows = pixels.start as u32 / TILE..(pixels.end as u32).div_ceil(TILE);
         rows.clone()
@@ -315,8 +324,8 @@ impl Rasterizer {
             .collect()
     }
 
-    /// Runs the forward pass of an image that is one band; grows the tile lists and repeats when
-    /// they were too short.
+    /// Runs the forward pass of an image that is one band; grows tile lists that are too short and
+    /// repeats the pass.
     pub fn forward(&mut self, params: &SplatBuffers, options: &RasterOptions) -> Result<()> {
         let bands = self.frame.bands.count();
         if bands > 1 {
@@ -326,18 +335,18 @@ impl Rasterizer {
         self.forward_bands(params, options, |_, _| Ok(()))
     }
 
-    /// Runs the forward pass band by band, and shows every band; grows the tile lists when they
-    /// were too short.
+    /// Runs the forward pass band by band and calls `visit` after each; grows tile lists that are
+    /// too short.
     pub fn forward_bands(
         &mut self,
         params: &SplatBuffers,
         options: &RasterOptions,
-        mut seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
+        mut visit: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
     ) -> Result<()> {
         for index in 0..self.frame.bands.count() {
             let band = self.frame.bands.get(index);
             self.forward_band(params, options, &band)?;
-            seen(&self.frame, &band)?;
+            visit(&self.frame, &band)?;
         }
         Ok(())
     }
@@ -365,9 +374,11 @@ impl Rasterizer {
         }
     }
 
-    /// Entries that a frame needed since the last [`Rasterizer::grow`], if they did not fit; `None`
-    /// when all was well. An error where a tile has more splats than the device goes through: it
-    /// would leave out the farthest of them.
+    /// Number of entries that a frame needed since the last [`Rasterizer::grow`], if they did not
+    /// fit; else `None`.
+    ///
+    /// # Errors
+    /// Where a tile has more splats than the loops of the device reach: it would omit the farthest.
     pub fn overflow(&self) -> Result<Option<usize>> {
         let status = self.frame.status.read()?;
         let (needed, longest) = (status[1] as usize, status[2]);
@@ -382,9 +393,8 @@ impl Rasterizer {
         Ok((needed > 0).then_some(needed))
     }
 
-    /// Makes room for tile lists of `needed` entries and a quarter more, or lists fewer rows of
-    /// tiles at once where the device binds no longer lists. Earlier recordings must not be run
-    /// again.
+    /// Allocates tile lists for `needed` entries and a quarter more, or bins fewer rows of tiles at
+    /// once where the device binds no longer lists. Earlier recordings must not be run again.
     pub fn grow(&mut self, needed: usize) -> Result<()> {
         let tiles = self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(TILE) as usize;
         let lists = (self.grouping, tiles);
@@ -406,8 +416,8 @@ impl Rasterizer {
         Ok(self.frame.status.write(&[0; 3])?)
     }
 
-    /// The tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests
-    /// and statistics.
+    /// Tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests and
+    /// statistics.
     pub fn tile_lists(&self) -> Result<Vec<Vec<u32>>> {
         let ranges = self.frame.lists.ranges.read()?;
         let splats = self.frame.lists.splats.read()?;

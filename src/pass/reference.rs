@@ -1,5 +1,5 @@
-//! f64 references of the whole render: raw parameters in, images out, and back. What the GPU passes are
-//! tested against, composed of the references that stand beside each pass.
+//! f64 references of the whole render, forward and backward. The GPU passes are tested against
+//! these compositions of the references beside each pass.
 use super::options::FeatureMode;
 use super::params::{Gradients, Params};
 use super::project::{self, Projected};
@@ -8,10 +8,10 @@ use super::raster_backward;
 use super::raster_forward::{self, Cutoffs, RenderedImage};
 use super::view::View;
 
-/// Everything the forward pass produced.
+/// Outputs of the forward pass.
 #[derive(Clone, Debug)]
 pub struct Forward {
-    /// [N] screen-space splats; `None` where dropped.
+    /// [N] screen-space splats; `None` where culled.
     pub projected: Vec<Option<Projected>>,
     /// [N, d] features as rendered.
     pub rendered_features: Vec<f64>,
@@ -26,8 +26,8 @@ pub fn forward(params: &Params, view: &View, mode: FeatureMode, cutoffs: &Cutoff
     forward_in_order(params, view, mode, cutoffs, None)
 }
 
-/// Renders in f64, in a given depth order instead of the true one: finite differences must not see
-/// two splats change places, which is a jump of the image.
+/// Renders in f64, in a given depth order instead of the true one: for finite differences, since
+/// the image jumps where two splats change places.
 pub fn forward_in_order(
     params: &Params,
     view: &View,
@@ -39,7 +39,7 @@ pub fn forward_in_order(
         (0..params.len()).map(|i| project::reference(params, i, view, cutoffs.alpha_min)).collect();
     let rendered_features = project::features_reference(&params.features, params.feature_dim, mode);
     let mut order: Vec<u32> = (0..params.len() as u32).filter(|&i| projected[i as usize].is_some()).collect();
-    // f32 depth, as the sort keys on the GPU are: equal keys keep index order (the sort is stable).
+    // f32 depth as in the sort keys on the GPU; the sort is stable, so equal keys keep index order.
     let depth = |i: u32| projected[i as usize].as_ref().map_or(0.0, |p| p.depth) as f32;
     order.sort_by(|&a, &b| depth(a).total_cmp(&depth(b)));
     let order = given.map_or(order, <[u32]>::to_vec);
@@ -54,8 +54,8 @@ pub fn forward_in_order(
     Forward { projected, rendered_features, order, image }
 }
 
-/// Back-propagates upstream plane gradients: `upstream` [(4 + d) + 1, H, W] as documented at
-/// [`raster_backward`], the last plane being ∂L/∂alpha.
+/// Back-propagates gradients by the planes, `upstream` [(4 + d) + 1, H, W], the last by alpha (see
+/// [`raster_backward`]).
 pub fn backward(
     params: &Params,
     view: &View,

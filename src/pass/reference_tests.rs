@@ -1,5 +1,4 @@
-//! Central differences of the reference itself: the analytic backward is right before any shader is
-//! compared with it.
+//! Tests of the analytic gradients of the reference against central differences.
 use super::options::FeatureMode;
 use super::params::Params;
 use super::raster_forward::Cutoffs;
@@ -38,8 +37,9 @@ fn twisted(view: &View, xi: [f64; 6]) -> View {
     View { rotation: moved.rotation, translation: moved.translation, ..view.clone() }
 }
 
-/// |numeric − analytic| ≤ 1e-5 of the largest gradient of its class: central differences with step 1e-5 in f64
-/// carry about 1e-10 from truncation and 1e-8 from rounding of a loss of size 1e2.
+/// Asserts |numeric − analytic| ≤ 1e-5 of the largest gradient of the class: central differences
+/// with step 1e-5 in f64 have an error of about 1e-10 from truncation and 1e-8 from rounding of a
+/// loss of size 1e2.
 fn assert_class(name: &str, pairs: &[(f64, f64)]) {
     let scale = pairs.iter().fold(1e-3, |m: f64, p| m.max(p.0.abs()));
     for (k, (numeric, analytic)) in pairs.iter().enumerate() {
@@ -49,6 +49,11 @@ fn assert_class(name: &str, pairs: &[(f64, f64)]) {
         );
     }
     assert!(pairs.iter().any(|p| p.0.abs() > 0.0), "{name}: nothing was tested");
+}
+
+/// World coordinates of a point in camera coordinates.
+fn world_point(view: &View, p: DVec3) -> DVec3 {
+    view.rotation.transpose() * (p - view.translation)
 }
 
 fn check(mut s: Scene, mode: FeatureMode, samples: usize) {
@@ -108,27 +113,27 @@ fn check(mut s: Scene, mode: FeatureMode, samples: usize) {
 }
 
 #[test]
-fn one_splat() {
+fn gradients_of_one_splat_match_differences() {
     check(scene(1, 3, 3, 5), FeatureMode::Linear, 12);
 }
 
 #[test]
-fn ten_splats_gauge_features() {
+fn gradients_of_gauge_features_match_differences() {
     check(scene(10, 3, 8, 6), FeatureMode::Gauge { epsilon: 1e-3, blocks: 2 }, 40);
 }
 
 #[test]
-fn hundred_splats() {
+fn gradients_of_hundred_splats_match_differences() {
     check(scene(100, 2, 3, 7), FeatureMode::Gauge { epsilon: 1e-3, blocks: 1 }, 20);
 }
 
 #[test]
-fn five_hundred_splats() {
+fn gradients_of_many_splats_match_differences() {
     check(scene(500, 1, 0, 8), FeatureMode::Linear, 10);
 }
 
 #[test]
-fn antialiased_splats() {
+fn gradients_of_antialiased_splats_match_differences() {
     let mut s = scene(60, 1, 0, 12);
     s.params.antialiased = true;
     // Thin enough that the dilation takes most of their opacity.
@@ -137,17 +142,16 @@ fn antialiased_splats() {
 }
 
 #[test]
-fn clamped_jacobian_and_clamped_alpha() {
+fn gradients_in_clamped_branches_match_differences() {
     let mut s = scene(10, 1, 0, 9);
-    let camera_point = |view: &View, p: DVec3| view.rotation.transpose() * (p - view.translation);
     // Far off-axis in x and in y, but large enough to reach the image.
-    s.params.means[0] = camera_point(&s.view, DVec3::new(-2.6, 0.2, 2.0));
+    s.params.means[0] = world_point(&s.view, DVec3::new(-2.6, 0.2, 2.0));
     s.params.log_scales[0] = DVec3::new(0.5, 0.1, 0.2);
-    s.params.means[1] = camera_point(&s.view, DVec3::new(0.1, 2.4, 2.0));
+    s.params.means[1] = world_point(&s.view, DVec3::new(0.1, 2.4, 2.0));
     s.params.log_scales[1] = DVec3::new(0.3, 0.5, 0.1);
     // Opacity 0.9991: clamped near its centre, not in its outskirts.
     s.params.opacity_logits[2] = 7.0;
-    s.params.means[2] = camera_point(&s.view, DVec3::new(0.05, 0.02, 1.9));
+    s.params.means[2] = world_point(&s.view, DVec3::new(0.05, 0.02, 1.9));
     let out = forward(&s.params, &s.view, FeatureMode::Linear, &Cutoffs::SMOOTH);
     let (negative, positive) = s.view.jacobian_limits();
     for (i, axis) in [(0, 0), (1, 1)] {
@@ -161,7 +165,7 @@ fn clamped_jacobian_and_clamped_alpha() {
 }
 
 #[test]
-fn gauge_jacobian_at_zero_features_is_one_over_epsilon() {
+fn zero_features_have_inverse_epsilon_gradient() {
     let mode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 1 };
     let raw = super::project_backward::features_reference(&[0.0; 3], &[1.0, -2.0, 0.5], 3, mode);
     for (a, b) in raw.iter().zip([1.0, -2.0, 0.5]) {
@@ -169,10 +173,10 @@ fn gauge_jacobian_at_zero_features_is_one_over_epsilon() {
     }
 }
 
-/// Moving the world and the camera together changes nothing, so the pose gradient equals minus what
-/// the same motion does to the splats: Σ_i ∂μ_i must be −Rᵀ∂ρ.
+/// A common motion of world and camera does not change the image, so the pose gradient equals the
+/// negative gradient by the same motion of the splats.
 #[test]
-fn common_translation_is_a_gauge() {
+fn pose_gradient_balances_the_mean_gradients() {
     let s = scene(50, 3, 0, 11);
     let out = forward(&s.params, &s.view, FeatureMode::Linear, &Cutoffs::STANDARD);
     let g = backward(&s.params, &s.view, FeatureMode::Linear, &Cutoffs::STANDARD, &out, &s.upstream);

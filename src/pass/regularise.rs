@@ -1,11 +1,11 @@
-//! Regularisers of the RGB stage (docs/internals/method.md#regularisers): depth near the stereo
-//! depth, and no needles.
+//! Regularisers of the RGB stage (docs/internals/method.md#regularisers): stereo depth, wanted
+//! alpha, and a penalty on needles.
 use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 
-/// Records `weight · Σ |D − A·d|/d` over pixels with reference depth d > 0, as gradients by D = Σwz
-/// and A; without a reference both gradients become zero. Weight: divide by the number of pixels
-/// for a mean.
+/// Records the gradients by D = Σwz and A of `weight · Σ |D − A·d|/d` over pixels with reference
+/// depth d > 0; both become zero without a reference. For a mean, `weight` is divided by the number
+/// of pixels.
 pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<&Buffer<f32>>, weight: f64) {
     rec.pass("regularisers");
     let pixels = frame.pixels();
@@ -28,7 +28,7 @@ pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
 
-/// The CPU reference: (loss, gradients by D and by A).
+/// CPU reference of [`record_depth`]: (loss, gradients by D and by A).
 pub fn depth_l1(depth: &[f64], alpha: &[f64], reference: &[f64], weight: f64) -> (f64, Vec<[f64; 2]>) {
     let mut loss = 0.0;
     let gradient = (0..depth.len()).map(|i| {
@@ -44,8 +44,8 @@ pub fn depth_l1(depth: &[f64], alpha: &[f64], reference: &[f64], weight: f64) ->
     (loss, gradient)
 }
 
-/// Adds the gradient of `weight · Σ |A − a|` by A, over pixels with a wanted alpha a ≥ 0, to what
-/// [`record_depth`] left.
+/// Records the gradient by A of `weight · Σ |A − a|` over pixels with a wanted alpha a ≥ 0, added
+/// to that of [`record_depth`].
 pub fn record_alpha(rec: &mut Recorder, frame: &FrameBuffers, wanted: &Buffer<f32>, weight: f64) {
     rec.pass("regularisers");
     let pixels = frame.pixels();
@@ -61,7 +61,7 @@ pub fn record_alpha(rec: &mut Recorder, frame: &FrameBuffers, wanted: &Buffer<f3
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
 
-/// The CPU reference: (loss, gradient by A).
+/// CPU reference of [`record_alpha`]: (loss, gradient by A).
 pub fn alpha_l1(alpha: &[f64], wanted: &[f64], weight: f64) -> (f64, Vec<f64>) {
     let pairs = || alpha.iter().zip(wanted);
     let loss = pairs().filter(|(_, w)| **w >= 0.0).map(|(a, w)| weight * (a - w).abs()).sum();
@@ -86,7 +86,8 @@ pub fn record_ratio(
     rec.dispatch_threads(call, [count as u32, 1, 1]);
 }
 
-/// The CPU reference: (loss, gradient by the log-scales of one splat). Below e^10 it is exact.
+/// CPU reference of [`record_ratio`]: (loss, gradient by the log-scales of one splat). The shader
+/// is exact for ratios up to e^10.
 pub fn ratio_penalty(log_scales: [f64; 3], weight: f64, limit: f64) -> (f64, [f64; 3]) {
     let (mut high, mut low) = (0, 0);
     for k in 1..3 {
@@ -108,7 +109,7 @@ mod tests {
     use crate::math::Random;
 
     #[test]
-    fn ratio_gradient_matches_differences_and_the_gpu() {
+    fn ratio_gradient_matches_differences_and_device() {
         let device = crate::gpu::test_device();
         let mut random = Random::new(2);
         let rows: Vec<[f32; 3]> = (0..97).map(|_| [0; 3].map(|_| random.normal() as f32 * 2.0)).collect();
@@ -123,12 +124,12 @@ mod tests {
             let (_, gradient) = ratio_penalty(row, 0.5, 8.0);
             active += usize::from(gradient != [0.0; 3]);
             for k in 0..3 {
-                let at = |s: f64| {
+                let loss_at = |s: f64| {
                     let mut r = row;
                     r[k] += s;
                     ratio_penalty(r, 0.5, 8.0).0
                 };
-                let difference = (at(1e-6) - at(-1e-6)) / 2e-6;
+                let difference = (loss_at(1e-6) - loss_at(-1e-6)) / 2e-6;
                 assert!((difference - gradient[k]).abs() < 1e-5 * (1.0 + gradient[k].abs()));
                 assert!((f64::from(got[k]) - 1.0 - gradient[k]).abs() < 1e-5 * (1.0 + gradient[k].abs()));
             }
@@ -137,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn one_degenerate_splat_does_not_make_the_penalty_infinite() {
+    fn ratio_of_degenerate_splat_is_capped() {
         let device = crate::gpu::test_device();
         // A ratio of e^90, more than f32 holds.
         let log_scales = device.buffer_from("log scales", &[45.0f32, 0.0, -45.0]).unwrap();
@@ -151,7 +152,7 @@ mod tests {
     }
 
     #[test]
-    fn depth_gradient_matches_differences_and_the_gpu() {
+    fn depth_gradient_matches_differences_and_device() {
         let device = crate::gpu::test_device();
         let mut random = Random::new(6);
         let (width, height) = (13u32, 9u32);
@@ -188,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn alpha_gradient_matches_differences_and_gpu() {
+    fn alpha_gradient_matches_differences_and_device() {
         let device = crate::gpu::test_device();
         let mut random = Random::new(7);
         let (width, height) = (13u32, 9u32);

@@ -1,4 +1,4 @@
-//! Renders a scene that stays on the GPU to images on the host.
+//! Renderer of a GPU-resident scene to images on the host.
 use super::bands::Band;
 use super::channels::BASE_CHANNELS;
 use super::frame::FrameBuffers;
@@ -12,14 +12,14 @@ use crate::scene::{Camera, Image, RgbImage, Splats};
 use crate::{Error, Result};
 use std::ops::Range;
 
-/// Alpha from which a pixel has a depth: below, Σ w z says little about any surface
+/// Least alpha of a pixel with a depth: below it Σ w z describes no surface
 /// (docs/internals/method.md#forward-rasterisation).
 pub const DEPTH_ALPHA_MIN: f32 = shaders::pack::DEPTH_ALPHA_MIN as f32;
 
 /// One rendered view.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RenderedFrame {
-    /// [H, W] RGB on the background. Not clamped: values may pass 1.
+    /// [H, W] RGB on the background, not clamped: values may exceed 1.
     pub rgb: RgbImage,
     /// [H, W] in [0, 1).
     pub alpha: Image<f32>,
@@ -31,7 +31,7 @@ pub struct RenderedFrame {
     pub features: Vec<f32>,
 }
 
-/// GPU-resident splats with their features. Cheap to call for many views of one size.
+/// GPU-resident splats with their features. Views of one size share their buffers.
 pub struct Renderer {
     device: Device,
     splats: SplatBuffers,
@@ -43,14 +43,14 @@ pub struct Renderer {
 
 impl Renderer {
     /// Uploads splats and their raw features [N, d] (empty and 0 for none). All SH coefficients are
-    /// used; the near plane is a hundredth of the median depth that the first rendered camera sees,
-    /// unless [`Renderer::with_near`].
+    /// used. Without [`Renderer::with_near`], the near plane is a hundredth of the median depth of
+    /// the splats in front of the first rendered camera.
     pub fn new(device: &Device, splats: &Splats, features: &[f32], feature_dim: usize) -> Result<Renderer> {
         let buffers = SplatBuffers::upload(device, splats, features, feature_dim)?;
         Ok(Renderer::from_buffers(device, buffers))
     }
 
-    /// Renders buffers that something else (training) owns and may change between views.
+    /// Renders buffers with another owner, which may change them between views.
     pub fn from_buffers(device: &Device, splats: SplatBuffers) -> Renderer {
         let options = RasterOptions { sh_degree: splats.sh_degree, ..RasterOptions::default() };
         Renderer {
@@ -69,7 +69,7 @@ impl Renderer {
         self
     }
 
-    /// Sets the colour behind everything.
+    /// Sets the background colour.
     pub fn with_background(mut self, background: [f64; 3]) -> Renderer {
         self.background = background;
         self
@@ -99,33 +99,33 @@ impl Renderer {
         Ok(out)
     }
 
-    /// Renders one view that the device holds at once; it stays on the device.
+    /// Renders one view to the device, which must hold it at once.
     pub fn draw(&mut self, camera: &Camera) -> Result<&Rasterizer> {
         let options = self.options;
-        let (rasterizer, splats) = self.ready(camera)?;
+        let (rasterizer, splats) = self.prepare(camera)?;
         rasterizer.forward(splats, &options)?;
         Ok(rasterizer)
     }
 
-    /// Renders one view band by band and shows every band while it is on the device.
+    /// Renders one view band by band and calls `visit` for each while it is on the device.
     pub fn draw_bands(
         &mut self,
         camera: &Camera,
-        seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
+        visit: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
     ) -> Result<()> {
         let options = self.options;
-        let (rasterizer, splats) = self.ready(camera)?;
-        rasterizer.forward_bands(splats, &options, seen)
+        let (rasterizer, splats) = self.prepare(camera)?;
+        rasterizer.forward_bands(splats, &options, visit)
     }
 
-    /// [N] pixels of a view that each splat shows: its blending weight summed over them, 0 for what
-    /// is hidden or outside.
+    /// [N] blending weight of each splat, summed over the pixels of a view; 0 for hidden splats and
+    /// those outside.
     ///
-    /// `∂/∂c_i Σ_px C(px) = Σ_px w_i(px)`: the way back of a loss that adds up one colour.
+    /// `∂/∂c_i Σ_px C(px) = Σ_px w_i(px)`: the gradient of a loss that sums one colour channel.
     pub fn weights(&mut self, camera: &Camera) -> Result<Vec<f32>> {
         let options = RasterOptions { sh_degree: 0, ..self.options };
         let device = self.device.clone();
-        let (rasterizer, splats) = self.ready(camera)?;
+        let (rasterizer, splats) = self.prepare(camera)?;
         let ones = vec![1f32; camera.width as usize * camera.height as usize];
         for index in 0..rasterizer.frame().bands.count() {
             let band = rasterizer.frame().bands.get(index);
@@ -137,13 +137,13 @@ impl Renderer {
             rec.run()?;
         }
         let sums = rasterizer.frame().colour_gradients(splats.count)?;
-        // Nothing is to be left of it for a loss that uses other planes.
+        // Cleared, because a loss on other planes would leave these values.
         rasterizer.frame().planes_grad.write_at(0, &vec![0f32; rasterizer.frame().bands.pixels()])?;
         Ok(sums.iter().map(|g| g[0]).collect())
     }
 
-    /// A rasteriser that is set to the camera, and the splats.
-    fn ready(&mut self, camera: &Camera) -> Result<(&mut Rasterizer, &SplatBuffers)> {
+    /// Returns a rasteriser set to the camera, and the splats.
+    fn prepare(&mut self, camera: &Camera) -> Result<(&mut Rasterizer, &SplatBuffers)> {
         if self.near <= 0.0 {
             self.near = 0.01 * self.median_depth(camera)?;
         }
@@ -178,7 +178,7 @@ impl Renderer {
 }
 
 impl RenderedFrame {
-    /// A frame that nothing was rendered into.
+    /// A frame of zeros.
     pub fn empty(width: usize, height: usize, feature_dim: usize) -> RenderedFrame {
         RenderedFrame {
             rgb: RgbImage { width, height, data: vec![[0.0; 3]; width * height] },
@@ -189,7 +189,7 @@ impl RenderedFrame {
         }
     }
 
-    /// Copies what a band answers for to the host; features only where this frame has them.
+    /// Copies the inner pixels of a band to the host, with the features of this frame.
     pub fn read_band(&mut self, frame: &FrameBuffers, band: &Band) -> Result<()> {
         self.read_surface(frame, band)?;
         self.read_features(frame, band, 0, 0..self.feature_dim)

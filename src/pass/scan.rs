@@ -2,7 +2,7 @@
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 
-/// Scratch space; the length of the input is only known to the device.
+/// Scratch space of the scan. The device reads the length of the input.
 pub struct Scan {
     sums: Buffer<u32>,
     lanes: u32,
@@ -11,14 +11,14 @@ pub struct Scan {
 impl Scan {
     /// Allocates one word per lane.
     pub fn new(device: &Device) -> Result<Scan> {
-        // Each lane walks a contiguous chunk twice. Step 2 is one workgroup of 256 threads, so 256
-        // lanes keep it short on the CPU, while a GPU needs thousands of threads to be busy.
+        // Each lane walks a contiguous chunk twice. Step 2 is one workgroup of 256 threads: 256
+        // lanes keep it short on the CPU, while a GPU needs thousands of threads.
         let lanes = if device.info().is_cpu { 256 } else { 16384 };
         Ok(Scan { sums: device.buffer::<u32>("scan sums", lanes as usize)?, lanes })
     }
 
-    /// `starts[i] = values[0] + .. + values[i - 1]` for the first `count[0]` elements, and
-    /// `total[0]` the sum of them all. `values` and `starts` are different buffers. Twin:
+    /// Records `starts[i] = values[0] + .. + values[i - 1]` for the first `count[0]` elements, and
+    /// their sum in `total[0]`. `values` and `starts` are different buffers. Reference:
     /// [`exclusive_scan`].
     pub fn record(
         &self,
@@ -53,7 +53,7 @@ impl Scan {
     }
 }
 
-/// Twin of [`Scan::record`]: the starts and the total.
+/// CPU reference of [`Scan::record`]: the starts and the total.
 pub fn exclusive_scan(values: &[u32]) -> (Vec<u32>, u32) {
     let mut sum = 0u32;
     let starts = values
@@ -73,12 +73,12 @@ mod tests {
     use crate::gpu::test_device;
 
     #[test]
-    fn equals_its_twin_at_awkward_sizes() {
+    fn scan_at_odd_sizes_matches_reference() {
         let device = test_device();
         let scan = Scan::new(&device).unwrap();
         for n in [0usize, 1, 2, 255, 256, 257, 1000, 70_001] {
             let values: Vec<u32> = (0..n).map(|i| (i as u32).wrapping_mul(2654435761) >> 20).collect();
-            // One more element than counted: it must stay untouched.
+            // One more element than counted, which must not change.
             let buffer = device.buffer_from("values", &[values.as_slice(), &[7]].concat()).unwrap();
             let count = device.buffer_from("count", &[n as u32]).unwrap();
             let starts = device.buffer_from("starts", &vec![99u32; n + 1]).unwrap();

@@ -1,29 +1,29 @@
 //! Stable least-significant-digit radix sort of (key, value) pairs of `u32`, eight bits at a time,
-//! in two shapes.
+//! by two algorithms.
 //!
-//! [`SortAlgorithm::Chunks`] gives every lane one contiguous chunk: count digits, turn the counts into
-//! places, move. Measured on lavapipe (Mesa 22.3.6, two cores): 100k pairs by 32 bits in about 3
-//! ms, where a classic 256-thread 4-bit sort takes 180. [`SortAlgorithm::Sweep`] is for GPUs, after Adinets
-//! & Merrill, "Onesweep" (2022): digits of all passes are counted at once, then each pass reads and
-//! writes every pair once, neighbours beside neighbours; tiles learn where their digits begin from
-//! the tiles before them while those run, or count for themselves where those do not go on. Both
-//! are correct on any device and any subgroup size.
+//! [`SortAlgorithm::Chunks`] gives every lane one contiguous chunk: count digits, scan the counts
+//! to positions, move. Measured on lavapipe (Mesa 22.3.6, two cores): 100k pairs by 32 bits in
+//! about 3 ms, where a classic 256-thread 4-bit sort takes 180. [`SortAlgorithm::Sweep`] is
+//! OneSweep (Adinets & Merrill 2022), for GPUs: one pass counts the digits of all passes, then each
+//! pass reads and writes every pair once, coalesced. A partition tile finds its exclusive prefix by
+//! decoupled look-back, and counts a predecessor itself where that makes no progress. Both are
+//! correct on any device and any subgroup size.
 use super::adam::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, LOOP_ROUNDS, Recorder, shaders};
 use crate::pass::KernelVariant;
 
-/// How the work is divided.
+/// Algorithm of the radix sort.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SortAlgorithm {
-    /// A chunk of the pairs per lane: CPU devices.
+    /// A chunk of the pairs per lane, for CPU devices.
     Chunks,
-    /// Tiles in one sweep per digit: GPUs.
+    /// OneSweep, for GPUs.
     Sweep,
 }
 
 impl SortAlgorithm {
-    /// The faster one for a kind of device, unless it gives wrong results there.
+    /// The faster algorithm for the device, unless it is disabled.
     pub fn of(device: &Device) -> SortAlgorithm {
         let info = device.info();
         match (if info.is_cpu { KernelVariant::ChunkSort } else { KernelVariant::SweepSort })
@@ -44,20 +44,20 @@ pub struct Sort {
 enum Work {
     /// [lanes, 256] digit counts.
     Chunks { histogram: Buffer<u32>, lanes: u32 },
-    /// [4, 256] digit counts of the passes, and per pass what its tiles tell each other.
+    /// [4, 256] digit counts of the passes, and the tile status of each pass.
     Sweep { digits: Buffer<u32>, tiles: Buffer<u32> },
 }
 
 /// Bits per pass: 256 counters for each of 8 lanes are 8 KiB of shared memory.
 const DIGIT_BITS: u32 = 8;
-/// Most passes: digits of a 32-bit key.
+/// Most passes, for 32-bit keys.
 const PASSES: usize = (u32::BITS / DIGIT_BITS) as usize;
-/// Pairs per tile in `glsl/sort_sweep.comp`.
+/// Pairs per partition tile in `glsl/sort_sweep.comp`.
 const TILE: usize = shaders::sort_sweep::TILE as usize;
 /// Pairs per thread in `glsl/sort_digits.comp`.
-const EACH: usize = shaders::sort_digits::EACH as usize;
+const DIGITS_PAIRS_PER_THREAD: usize = shaders::sort_digits::PAIRS_PER_THREAD as usize;
 
-/// What one call sorts by.
+/// Bits of the key that one call sorts by.
 #[derive(Clone, Copy)]
 struct Key {
     mask: u32,
@@ -65,17 +65,17 @@ struct Key {
 }
 
 impl Sort {
-    /// Allocates 8 bytes per pair and the counters, in the shape that suits the device.
+    /// Allocates 8 bytes per pair and the counters, for the fastest algorithm of the device.
     pub fn new(device: &Device, capacity: usize) -> Result<Sort> {
         Self::with(device, capacity, SortAlgorithm::of(device))
     }
 
-    /// [`Sort::new`] in a given shape.
-    pub fn with(device: &Device, capacity: usize, shape: SortAlgorithm) -> Result<Sort> {
-        let work = match shape {
+    /// [`Sort::new`] with a given algorithm.
+    pub fn with(device: &Device, capacity: usize, algorithm: SortAlgorithm) -> Result<Sort> {
+        let work = match algorithm {
             SortAlgorithm::Chunks => {
-                // 256 measured best on lavapipe for 100k to 1M pairs; the chunks of more would be
-                // too long for its loops.
+                // 256 lanes measured best on lavapipe for 100k to 1M pairs; more pairs need more
+                // lanes, since its loops are limited.
                 let lanes = capacity.div_ceil(LOOP_ROUNDS / 2).next_multiple_of(256).max(256);
                 Work::Chunks {
                     histogram: device.buffer::<u32>("sort histogram", 256 * lanes)?,
@@ -90,9 +90,9 @@ impl Sort {
         Ok(Sort { scratch: device.buffer::<u32>("sort scratch", 2 * capacity)?, work })
     }
 
-    /// Sorts the first `count[0]` elements of `pairs` (`[N]` of (key, value)) by the lowest `bits`
-    /// bits of the key, keeping the order of equal keys; what lies behind them is undefined
-    /// afterwards. `count` is read on the device. Twin: [`sort_pairs`].
+    /// Records the stable sort of the first `count[0]` elements of `pairs` (`[N]` of (key, value))
+    /// by the lowest `bits` bits of the key; later elements are undefined afterwards. `count` is
+    /// read on the device. Reference: [`sort_pairs`].
     pub fn record(&self, rec: &mut Recorder, pairs: &Buffer<u32>, count: &Buffer<u32>, bits: u32) {
         if pairs.bytes() > self.scratch.bytes() {
             rec.fail(format!("sort: `{}` has more pairs than the capacity of the sort", pairs.name()));
@@ -154,7 +154,7 @@ fn record_chunks(
     );
 }
 
-/// Where the elements with each digit begin, for all passes.
+/// Records the digit histograms of all passes and their exclusive scans.
 fn record_digits(
     rec: &mut Recorder,
     pairs: &Buffer<u32>,
@@ -167,7 +167,7 @@ fn record_digits(
         &shaders::sort_digits::Bindings { pairs, count, digits },
         &shaders::sort_digits::Push { mask: key.mask, passes: key.passes },
     );
-    rec.dispatch(call, rows_of_groups(capacity(pairs).div_ceil(EACH)));
+    rec.dispatch(call, rows_of_groups(capacity(pairs).div_ceil(DIGITS_PAIRS_PER_THREAD)));
     let call = shaders::sort_bases::call(&shaders::sort_bases::Bindings { digits });
     rec.dispatch(call, [key.passes.max(1), 1, 1]);
 }
@@ -183,18 +183,18 @@ fn record_sweep(
         &shaders::sort_sweep::Bindings { pairs: from, count, digits, tiles, sorted: to },
         &shaders::sort_sweep::Push { pass, mask: key.mask, stride: (tiles.len() / PASSES) as u32 },
     );
-    // Groups beyond the last tile find nothing to do; dimensions end at 65535.
+    // Workgroups beyond the last tile do nothing; a dimension may be limited to 65535.
     let groups = capacity(from).div_ceil(TILE).max(1);
     let row = groups.min(32768);
     rec.dispatch(call, [row as u32, groups.div_ceil(row) as u32, 1]);
 }
 
-/// Pairs in a buffer.
+/// Number of pairs that a buffer holds.
 fn capacity(pairs: &Buffer<u32>) -> usize {
     pairs.bytes() as usize / std::mem::size_of::<[u32; 2]>()
 }
 
-/// Twin of [`Sort::record`].
+/// CPU reference of [`Sort::record`].
 pub fn sort_pairs(pairs: &mut [[u32; 2]], bits: u32) {
     let mask = if bits >= 32 { u32::MAX } else { (1 << bits) - 1 };
     pairs.sort_by_key(|pair| pair[0] & mask);
@@ -216,29 +216,29 @@ mod tests {
             .collect()
     }
 
-    /// In both shapes, each against the reference.
+    /// Sorts by both algorithms, each compared with the reference.
     fn sorted_on_device(pairs: &[[u32; 2]], n: usize, bits: u32) -> Vec<[u32; 2]> {
         let device = test_device();
         let mut expected = pairs[..n].to_vec();
         sort_pairs(&mut expected, bits);
-        for shape in [SortAlgorithm::Chunks, SortAlgorithm::Sweep] {
-            let sorted = sorted_in(&device, pairs, n, bits, shape);
+        for algorithm in [SortAlgorithm::Chunks, SortAlgorithm::Sweep] {
+            let sorted = sorted_by(&device, pairs, n, bits, algorithm);
             let wrong = sorted.iter().zip(&expected).filter(|(a, b)| a != b).count();
-            assert_eq!(wrong, 0, "{n} pairs, {bits} bits, {shape:?}");
+            assert_eq!(wrong, 0, "{n} pairs, {bits} bits, {algorithm:?}");
         }
         expected
     }
 
-    fn sorted_in(
+    fn sorted_by(
         device: &Device,
         pairs: &[[u32; 2]],
         n: usize,
         bits: u32,
-        shape: SortAlgorithm,
+        algorithm: SortAlgorithm,
     ) -> Vec<[u32; 2]> {
         let buffer = device.buffer_from("pairs", pairs.as_flattened()).unwrap();
         let count = device.buffer_from("count", &[n as u32]).unwrap();
-        let sort = Sort::with(device, pairs.len(), shape).unwrap();
+        let sort = Sort::with(device, pairs.len(), algorithm).unwrap();
         let mut rec = Recorder::new(device, "sort");
         sort.record(&mut rec, &buffer, &count, bits);
         rec.run().unwrap();
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn equals_its_twin_at_awkward_sizes() {
+    fn sort_at_odd_sizes_matches_reference() {
         for n in [0, 1, 2, 7, 8, 255, 256, 257, 2048, 2049, 50_000] {
             for (bits, range) in [(32, 1u64 << 32), (16, 1 << 16), (10, 1 << 10), (24, 7), (5, 1 << 32)] {
                 sorted_on_device(&random_pairs(n, range, n as u64 + u64::from(bits)), n, bits);
@@ -255,12 +255,12 @@ mod tests {
     }
 
     #[test]
-    fn sorts_only_the_counted_part() {
+    fn sort_of_a_part_matches_reference() {
         sorted_on_device(&random_pairs(1000, 50, 3), 600, 16);
     }
 
     #[test]
-    fn sorts_positive_floats_by_their_bits() {
+    fn sort_of_float_bits_orders_floats() {
         let depths: Vec<f32> = (0..3000).map(|i| 0.2 + ((i * 7919) % 3000) as f32 * 0.01).collect();
         let pairs: Vec<[u32; 2]> = depths.iter().enumerate().map(|(i, d)| [d.to_bits(), i as u32]).collect();
         let sorted = sorted_on_device(&pairs, pairs.len(), 32);

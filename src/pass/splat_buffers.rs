@@ -6,7 +6,7 @@ use crate::{Error, Result};
 /// Raw parameters of N splats, or gradients by them, on the GPU.
 #[derive(Clone)]
 pub struct SplatBuffers {
-    /// N. Buffers may be longer (after pruning); only the first N splats are used.
+    /// N. Buffers may be longer; only the first N splats are used.
     pub count: usize,
     /// Degree of the stored coefficients, 0–3.
     pub sh_degree: u32,
@@ -30,6 +30,9 @@ pub struct SplatBuffers {
 
 impl SplatBuffers {
     /// Copies splats and their features [N, d] to the GPU (`features` empty and d = 0 for none).
+    ///
+    /// # Errors
+    /// Where the lengths of the arrays do not agree.
     pub fn upload(
         device: &Device,
         splats: &Splats,
@@ -60,7 +63,7 @@ impl SplatBuffers {
         Ok(out)
     }
 
-    /// Zero-filled buffers for `count` splats; `label` begins their names.
+    /// Allocates zero-filled buffers for `count` splats; `label` begins their names.
     pub fn zeros(
         device: &Device,
         label: &str,
@@ -68,23 +71,23 @@ impl SplatBuffers {
         sh_degree: u32,
         feature_dim: usize,
     ) -> Result<SplatBuffers> {
-        let make =
+        let zeros =
             |name: &str, floats: usize| device.buffer::<f32>(&format!("{label} {name}"), floats.max(4));
         Ok(SplatBuffers {
             count,
             sh_degree,
             feature_dim,
             antialiased: false,
-            means: make("means", 3 * count)?,
-            log_scales: make("log_scales", 3 * count)?,
-            quats: make("quats", 4 * count)?,
-            opacity_logits: make("opacity_logits", count)?,
-            sh: make("sh", 3 * count * sh_coefficients(sh_degree))?,
-            features: make("features", count * feature_dim)?,
+            means: zeros("means", 3 * count)?,
+            log_scales: zeros("log_scales", 3 * count)?,
+            quats: zeros("quats", 4 * count)?,
+            opacity_logits: zeros("opacity_logits", count)?,
+            sh: zeros("sh", 3 * count * sh_coefficients(sh_degree))?,
+            features: zeros("features", count * feature_dim)?,
         })
     }
 
-    /// Zero-filled buffers of the same shape, for gradients or optimiser moments.
+    /// Allocates zero-filled buffers of the same shape, for gradients.
     pub fn zeros_like(&self, device: &Device) -> Result<SplatBuffers> {
         SplatBuffers::zeros(device, "gradient", self.count, self.sh_degree, self.feature_dim)
     }
@@ -94,7 +97,7 @@ impl SplatBuffers {
         sh_coefficients(self.sh_degree)
     }
 
-    /// Back to the host: splats and features [N, d].
+    /// Copies splats and features [N, d] to the host.
     pub fn download(&self) -> Result<(Splats, Vec<f32>)> {
         let n = self.count;
         let floats = |b: &Buffer<f32>, len: usize| b.read_range(0..len);

@@ -1,12 +1,11 @@
-//! The image loss `w₁·mean|x−y| + w₂·(1 − mean SSIM(x,y))` and its gradient with respect to the
-//! rendered image x.
+//! Image loss `w₁·mean|x−y| + w₂·(1 − mean SSIM(x,y))` and its gradient by the rendered image x.
 //!
-//! SSIM as 3D Gaussian splatting uses it (Wang et al. 2004; Kerbl et al. 2023): 11×11 Gaussian
-//! window, σ = 1.5, normalised, zero padding, per channel, C1 = 1e-4, C2 = 9e-4, mean over all
-//! pixels and channels. Where pixels have weights w, x is replaced by `y + w·(x − y)`: a pixel that
-//! does not count looks as it should in the windows of its neighbours, and the means are over the
-//! weights. With ∗ the (symmetric) window and S = A1·A2/(B1·B2), the derivative is three more
-//! blurs: `∂/∂x = ∗(∂S/∂μx) + 2x·∗(∂S/∂E[x²]) + y·∗(∂S/∂E[xy])`.
+//! SSIM as in 3D Gaussian splatting (Wang et al. 2004; Kerbl et al. 2023): 11×11 Gaussian window, σ
+//! = 1.5, normalised, zero padding, per channel, C1 = 1e-4, C2 = 9e-4, mean over all pixels and
+//! channels. Where pixels have weights w, x is replaced by `y + w·(x − y)`: a pixel of weight 0
+//! equals the target in the windows of its neighbours, and the means are over the weights. With ∗
+//! the (symmetric) window and S = A1·A2/(B1·B2), the derivative is three more blurs: `∂/∂x =
+//! ∗(∂S/∂μx) + 2x·∗(∂S/∂E[x²]) + y·∗(∂S/∂E[xy])`.
 use super::bands::{Band, Bands};
 use super::sum;
 use crate::Result;
@@ -17,11 +16,11 @@ use serde::{Deserialize, Serialize};
 
 /// Taps of the SSIM window.
 pub const WINDOW: usize = shared::WINDOW.len();
-/// Half of the window: how far a pixel's influence reaches.
+/// Half of the window, in which a pixel has an influence.
 pub const HALF: usize = shared::HALF as usize;
 const SIGMA: f64 = 1.5;
 
-/// The two parts of the image loss before weighting.
+/// The two terms of the image loss before weighting.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ImageLoss {
     /// Mean absolute difference.
@@ -37,7 +36,7 @@ impl ImageLoss {
     }
 }
 
-/// The normalised 1D Gaussian taps.
+/// Normalised 1D Gaussian taps.
 fn taps() -> [f64; WINDOW] {
     let mut w = [0.0; WINDOW];
     for (k, v) in w.iter_mut().enumerate() {
@@ -68,7 +67,7 @@ fn blur(plane: &[f64], width: usize, height: usize) -> Vec<f64> {
     out
 }
 
-/// The CPU reference, in f64: loss parts and gradient of [`ImageLoss::total`] for planar `[C, H, W]`
+/// CPU reference, in f64: loss terms and gradient of [`ImageLoss::total`] for planar `[C, H, W]`
 /// images.
 pub fn ssim_l1(
     rendered: &[f64],
@@ -82,7 +81,7 @@ pub fn ssim_l1(
     ssim_l1_weighted(rendered, target, &weights, width, height, l1_weight, dssim_weight)
 }
 
-/// [`ssim_l1`] with `[H, W]` weights of the pixels.
+/// [`ssim_l1`] with pixel weights `[H, W]`.
 pub fn ssim_l1_weighted(
     rendered: &[f64],
     target: &[f64],
@@ -103,7 +102,7 @@ pub fn ssim_l1_weighted(
         for i in 0..x.len() {
             let difference = x[i] - y[i];
             loss.l1 += difference.abs() / count;
-            // f64::signum(0) is 1; the subgradient there must be 0 or identical images would move.
+            // f64::signum(0) is 1; the subgradient at 0 must be 0.
             let sign = if difference == 0.0 { 0.0 } else { difference.signum() };
             gradient.push(weights[i] * (l1_weight * sign - dssim_weight * d[i]) / count);
         }
@@ -141,17 +140,17 @@ const STRIP: usize = shared::STRIP as usize;
 /// Colour channels.
 const CHANNELS: usize = 3;
 
-/// How rows are blurred.
+/// Kernel that blurs rows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SsimRowKernel {
-    /// A strip of a row per thread, in registers: CPU devices.
+    /// A strip of a row per thread, in registers, for CPU devices.
     Strips,
-    /// A span of a row per workgroup, in shared memory: GPUs.
+    /// A span of a row per workgroup, in shared memory, for GPUs.
     Shared,
 }
 
 impl SsimRowKernel {
-    /// The faster one for a kind of device, unless it gives wrong results there.
+    /// The faster kernel for the device, unless it is disabled.
     pub fn of(device: &Device) -> SsimRowKernel {
         let info = device.info();
         match (if info.is_cpu { KernelVariant::SsimStrips } else { KernelVariant::SsimShared })
@@ -163,8 +162,7 @@ impl SsimRowKernel {
     }
 }
 
-/// The GPU pass for one image size: scratch memory, reused for every view of that size and all its
-/// bands.
+/// GPU pass for one image size: scratch memory that all views of the size and their bands share.
 pub struct SsimL1 {
     bands: Bands,
     rows: SsimRowKernel,
@@ -178,12 +176,12 @@ pub struct SsimL1 {
 }
 
 impl SsimL1 {
-    /// Allocates for RGB images that are divided like this, with the rows that suit the device.
+    /// Allocates for RGB images in these bands, with the fastest row kernel of the device.
     pub fn new(device: &Device, bands: &Bands) -> Result<Self> {
         Self::with(device, bands, SsimRowKernel::of(device))
     }
 
-    /// [`SsimL1::new`] with given rows.
+    /// [`SsimL1::new`] with a given row kernel.
     pub fn with(device: &Device, bands: &Bands, rows: SsimRowKernel) -> Result<Self> {
         let (width, height) = (bands.width, bands.rows);
         let values = CHANNELS * width * height;
@@ -202,9 +200,9 @@ impl SsimL1 {
     }
 
     /// Records the pass for a band. `rendered` and `gradient` are planar `[≥3, rows, W]` stacks
-    /// whose first three planes count, `target` `[3, rows, W]`; with `covered`, the sum of the
-    /// weights of the whole image, `[4, rows, W]`, the last the weights of the pixels. Afterwards
-    /// `loss[slot]` is Σ|x−y| and `loss[slot+1]` ΣSSIM of the band: see [`SsimL1::loss`].
+    /// with RGB first, `target` is `[3, rows, W]`. With `covered`, the sum of the pixel weights of
+    /// the whole image, `target` is `[4, rows, W]`, the last plane the weights. Writes Σ|x−y| of
+    /// the band to `loss[slot]` and ΣSSIM to `loss[slot+1]`: see [`SsimL1::loss`].
     pub fn record(
         &self,
         rec: &mut Recorder,
@@ -278,13 +276,13 @@ impl SsimL1 {
         }
     }
 
-    /// The loss parts from the two sums that [`SsimL1::record`] leaves, added up over the bands.
+    /// Loss terms from the two sums of [`SsimL1::record`], added up over the bands.
     pub fn loss(&self, sums: [f64; 2], covered: Option<f64>) -> ImageLoss {
         let (all, count) = (self.values(None), self.values(covered));
         ImageLoss { l1: sums[0] / count, ssim: 1.0 - (all - sums[1]) / count }
     }
 
-    /// What means are over.
+    /// Number of values of a mean.
     fn values(&self, covered: Option<f64>) -> f64 {
         let pixels = covered.unwrap_or((self.bands.width * self.bands.height) as f64);
         CHANNELS as f64 * pixels
@@ -295,7 +293,7 @@ impl SsimL1 {
 mod tests {
     use super::*;
 
-    /// A reproducible pseudo-random number in [0, 1).
+    /// Reproducible pseudo-random number in [0, 1).
     fn noise(i: usize) -> f64 {
         let mut z = (i as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -303,14 +301,14 @@ mod tests {
     }
 
     #[test]
-    fn the_shaders_have_the_taps_of_the_twin() {
+    fn shader_taps_match_reference() {
         for (own, shader) in taps().iter().zip(shared::WINDOW) {
             assert!((own - shader).abs() < 1e-8, "{own} {shader}");
         }
     }
 
     #[test]
-    fn identical_images_have_ssim_one_and_no_gradient() {
+    fn ssim_of_equal_images_is_one() {
         let x: Vec<f64> = (0..3 * 20 * 17).map(noise).collect();
         let (loss, gradient) = ssim_l1(&x, &x, 20, 17, 0.8, 0.2);
         assert!((loss.ssim - 1.0).abs() < 1e-12 && loss.l1 == 0.0);
@@ -328,11 +326,11 @@ mod tests {
         let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
         for i in (0..x.len()).step_by(53) {
             let keep = x[i];
-            let mut at = |v: f64| {
+            let mut loss_at = |v: f64| {
                 x[i] = v;
                 ssim_l1(&x, &y, w, h, 0.8, 0.2).0.total(0.8, 0.2)
             };
-            let difference = (at(keep + step) - at(keep - step)) / (2.0 * step);
+            let difference = (loss_at(keep + step) - loss_at(keep - step)) / (2.0 * step);
             x[i] = keep;
             worst = worst.max((difference - gradient[i]).abs() / scale);
         }
@@ -350,23 +348,23 @@ mod tests {
         let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
         for i in (0..x.len()).step_by(37) {
             let (keep, step) = (x[i], 1e-6);
-            let mut at = |v: f64| {
+            let mut loss_at = |v: f64| {
                 x[i] = v;
                 loss(&x).0.total(0.8, 0.2)
             };
-            let difference = (at(keep + step) - at(keep - step)) / (2.0 * step);
+            let difference = (loss_at(keep + step) - loss_at(keep - step)) / (2.0 * step);
             x[i] = keep;
             assert!((difference - gradient[i]).abs() < 1e-6 * scale, "{i}: {difference} {}", gradient[i]);
             assert!(weights[i % (w * h)] > 0.0 || gradient[i] == 0.0, "a pixel without weight moves");
         }
-        // Whatever is rendered where the weight is 0 changes nothing.
+        // Rendered pixels of weight 0 do not change the loss.
         let before = loss(&x);
         (0..x.len()).filter(|i| weights[i % (w * h)] == 0.0).for_each(|i| x[i] = 9.0);
         assert_eq!(loss(&x), before);
     }
 
     #[test]
-    fn gpu_equals_the_twin_on_odd_sizes() {
+    fn ssim_at_odd_sizes_matches_reference() {
         let device = crate::gpu::test_device();
         // Neither side is a multiple of a strip or workgroup; the second is smaller than one strip
         // and window.

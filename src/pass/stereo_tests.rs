@@ -1,4 +1,4 @@
-//! Stereo with the plane sweep of the device.
+//! Tests of stereo with the plane sweep of the device.
 use crate::gpu::{Options, TestDevice, options, test_device};
 use crate::math::hash;
 use crate::pass::plane_sweep::{DevicePlaneSweep, GpuMatcher, Matcher, ReferenceView};
@@ -8,9 +8,9 @@ use crate::progress::Silent;
 use glam::{DVec3, Vec4};
 use splatvk_test_support::stereo::{breakfast, errors, synthetic, synthetic_from, within};
 
-/// With one source each, a reference and its source fit where all three views do not.
+/// The binding holds a reference and its one source, but not all three views.
 #[test]
-fn views_are_matched_in_groups_as_all_together() {
+fn grouped_views_match_as_all_together() {
     let set = synthetic(96, 72);
     let run = |binding: u64| {
         let options = Options { max_binding: Some(binding), ..options(None) };
@@ -29,49 +29,50 @@ fn views_are_matched_in_groups_as_all_together() {
 }
 
 #[test]
-fn device_and_twin_choose_the_same_planes() {
+fn device_planes_match_reference() {
     let device = test_device();
     let set = synthetic(96, 72);
     let options = StereoOptions { rounds: vec![1], ..StereoOptions::default() };
     let levels = pyramid(&set.images, &set.cameras, &set.sparse, &options).unwrap();
     let level = &levels[0];
-    let make = |start: &[Vec4]| {
+    let matchers = |start: &[Vec4]| {
         let gpu = GpuMatcher::new(&device, &level.luma, &level.references, &level.sources, start).unwrap();
         (gpu, CpuMatcher::new(level.luma.clone(), level.sources.clone(), start.to_vec()))
     };
-    // Rounding (exp, sqrt, order of sums) differs, so near ties may fall either way; anything else
-    // is a bug.
-    let compare = |a: &[Vec4], b: &[Vec4]| {
-        let same: Vec<usize> = (0..a.len())
-            .filter(|&k| (a[k].truncate() - b[k].truncate()).length() < 1e-4 * a[k].truncate().length())
-            .collect();
-        let worst = same.iter().map(|&k| (a[k].w - b[k].w).abs()).fold(0.0, f32::max);
-        assert!(same.len() * 1000 > a.len() * 985, "only {} of {} planes agree", same.len(), a.len());
-        assert!(worst < 2e-3, "costs differ by {worst}");
-    };
-    let (mut gpu, mut cpu) = make(&vec![Vec4::ZERO; level.pixels()]);
+    let (mut gpu, mut cpu) = matchers(&vec![Vec4::ZERO; level.pixels()]);
     for r in &level.references {
         let r = ReferenceView { seed: 5, planes: 24, ..*r };
         gpu.sweep(&r).unwrap();
         cpu.sweep(&r).unwrap();
     }
     let swept = cpu.planes().unwrap();
-    compare(&gpu.planes().unwrap(), &swept);
+    assert_same_planes(&gpu.planes().unwrap(), &swept);
     for (geometric, smoothness) in [(0.0, 0.0), (0.1, 0.0), (0.1, 0.1)] {
         for parity in 0..2 {
-            let (mut gpu, mut cpu) = make(&swept);
+            let (mut gpu, mut cpu) = matchers(&swept);
             let r = ReferenceView { seed: 9, geometric, smoothness, parity, ..level.references[1] };
             gpu.refine(&r).unwrap();
             cpu.refine(&r).unwrap();
             let refined = cpu.planes().unwrap();
             assert!(refined != swept, "refinement changed nothing");
-            compare(&gpu.planes().unwrap(), &refined);
+            assert_same_planes(&gpu.planes().unwrap(), &refined);
         }
     }
 }
 
+/// Asserts that planes and costs agree. Rounding (exp, sqrt, order of sums) differs, so nearly
+/// equal hypotheses may win either way.
+fn assert_same_planes(a: &[Vec4], b: &[Vec4]) {
+    let same: Vec<usize> = (0..a.len())
+        .filter(|&k| (a[k].truncate() - b[k].truncate()).length() < 1e-4 * a[k].truncate().length())
+        .collect();
+    let worst = same.iter().map(|&k| (a[k].w - b[k].w).abs()).fold(0.0, f32::max);
+    assert!(same.len() * 1000 > a.len() * 985, "only {} of {} planes agree", same.len(), a.len());
+    assert!(worst < 2e-3, "costs differ by {worst}");
+}
+
 #[test]
-fn two_slanted_planes_are_recovered_and_runs_repeat() {
+fn slanted_planes_are_recovered_reproducibly() {
     let device = test_device();
     let set = synthetic(160, 120);
     let run = || {
@@ -105,10 +106,10 @@ fn two_slanted_planes_are_recovered_and_runs_repeat() {
     assert!(run() == (depths, points), "same input and seed, different output");
 }
 
-/// Little parallax and sensor noise: 1.5 px of mismatch are 3 % of the depth, and noise is a tenth
-/// of the contrast.
+/// Little parallax and sensor noise: 1.5 px of mismatch are 3 % of the depth, and the noise is a
+/// tenth of the contrast.
 #[test]
-fn noisy_photos_with_little_parallax_give_a_surface() {
+fn noisy_photos_with_little_parallax_match() {
     let device = test_device();
     let mut set = synthetic_from(200, 150, 0.4);
     for (view, image) in set.images.iter_mut().enumerate() {
@@ -198,7 +199,7 @@ fn photos_of_different_sizes_are_matched() {
 }
 
 #[test]
-fn breakfast_depth_at_a_quarter_of_the_resolution() {
+fn breakfast_depth_at_quarter_resolution() {
     let device = test_device();
     let set = breakfast(4);
     let (depths, points) = dense(

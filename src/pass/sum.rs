@@ -1,7 +1,7 @@
 //! Sums of float buffers on the GPU, in a fixed order: the same bits on every run of one device.
 use crate::gpu::{Buffer, Recorder, shaders};
 
-/// Length of the scratch buffer that [`record`] needs; one workgroup makes each partial sum.
+/// Length of the scratch buffer of [`record`]; one workgroup computes each partial sum.
 pub const PARTIALS: usize = 64;
 
 /// Records `result[slot] = Σ values`. `partials` holds [`PARTIALS`] floats of scratch.
@@ -29,9 +29,9 @@ pub fn record(
 mod tests {
     use super::*;
 
-    /// More than the workgroups of all partial sums take at once.
+    /// More values than the threads of all partial sums.
     #[test]
-    fn every_value_counts() {
+    fn sum_of_many_values_is_complete() {
         let device = crate::gpu::test_device();
         let values = device.buffer_from("values", &[1.0f32; 40_000]).unwrap();
         let partials = device.buffer::<f32>("partials", PARTIALS).unwrap();

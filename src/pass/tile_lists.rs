@@ -1,25 +1,25 @@
-//! Memory of the tile lists that [`super::bin`] makes.
+//! Memory of the tile lists of [`super::bin`].
 use super::scan::Scan;
 use super::sort::Sort;
 use crate::Result;
 use crate::gpu::{Buffer, Device, LOOP_ROUNDS, shaders};
 use crate::pass::KernelVariant;
 
-/// Tile edge, pixels. 8 evaluates 2.9 times the pairs it blends, 16 six times (measured on the
-/// seeded scene).
+/// Tile edge, pixels. Tiles of 8 evaluate 2.9 times the pairs that they blend, tiles of 16 six
+/// times (measured on the seeded scene).
 pub const TILE: u32 = shaders::shared::layout::TILE as u32;
 
-/// How entries in splat order become lists per tile.
+/// Method that turns entries in splat order into lists per tile.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TileBinning {
-    /// A counter per (tile, lane): little work, but for few lanes only.
+    /// A counter per (tile, lane): little work, but few lanes only.
     Counting,
     /// A radix sort by tile: any number of lanes.
     Sorting,
 }
 
 impl TileBinning {
-    /// What suits the device.
+    /// The faster method for the device, unless it is disabled.
     pub fn of(device: &Device) -> TileBinning {
         let info = device.info();
         match (if info.is_cpu { KernelVariant::CountedLists } else { KernelVariant::SortedLists })
@@ -31,18 +31,19 @@ impl TileBinning {
     }
 }
 
-/// The tile lists of one frame and what it takes to make them.
+/// Tile lists of one frame, with the scratch buffers of the binning.
 pub(super) struct TileLists {
-    /// [tiles + 1]
+    /// [tiles + 1] starts of the lists.
     pub ranges: Buffer<u32>,
     /// [capacity] (splat, entry), grouped by tile, nearest first.
     pub splats: Buffer<u32>,
-    /// [N] entries of each splat, in depth order, and where they begin.
+    /// [N] number of entries of each splat, in depth order.
     pub counts: Buffer<u32>,
+    /// [N] first entry of each splat, in depth order.
     pub starts: Buffer<u32>,
     /// [1] entries of this frame, 0 when they did not fit.
     pub entry_count: Buffer<u32>,
-    /// Entries there is room for.
+    /// Most entries.
     pub capacity: usize,
     pub entries: Buffer<u32>,
     pub scan: Scan,
@@ -54,19 +55,19 @@ pub(super) enum Group {
     Sorting { entry_splats: Buffer<u32>, sort: Sort },
 }
 
-/// Lanes that write entries before a sort, and that read them behind it: enough to fill any GPU.
+/// Lanes that write entries before a sort and read them after it: enough to fill any GPU.
 pub(super) const SORTING_LANES: u32 = 1 << 16;
 
-/// Most entries of a lane of [`TileBinning::Counting`]: one that writes entries also passes rows and
-/// splats without any.
+/// Most entries of a lane of [`TileBinning::Counting`]: its loop also visits rows and splats
+/// without entries.
 const SHARE: usize = LOOP_ROUNDS / 2;
 
-/// Longest list of a tile that goes into [`LOOP_ROUNDS`]: a round for each splat and, at subgroups
-/// of four, up to half as many for groups of them.
+/// Longest tile list within [`LOOP_ROUNDS`]: a round per splat and, at subgroups of four, up to
+/// half as many for batches of splats.
 pub(super) const LONGEST_LIST: u32 = 40_000;
 
 impl TileLists {
-    /// Room for `capacity` entries of up to `splats` splats on `tiles` tiles.
+    /// Allocates for `capacity` entries of up to `splats` splats on `tiles` tiles.
     pub fn new(
         device: &Device,
         grouping: TileBinning,
@@ -99,14 +100,14 @@ impl TileLists {
     }
 }
 
-/// Few lanes keep a CPU device busy, and more only add counters to clear and scan, until each has
-/// its [`SHARE`].
+/// Number of lanes of [`TileBinning::Counting`]. Few lanes keep a CPU device busy, and more only
+/// add counters to clear and scan, unless a lane would exceed its [`SHARE`].
 fn counting_lanes(tiles: usize, capacity: usize, binding: u64) -> u32 {
     capacity.div_ceil(SHARE).max(64).min(most_lanes(tiles, binding)) as u32 / 8 * 8
 }
 
-/// The number of lanes is bounded by memory: 16 M counters are 64 MiB, half of the smallest buffer
-/// limit that Vulkan allows.
+/// Most lanes that memory allows: 16 M counters are 64 MiB, half of the smallest buffer limit that
+/// Vulkan allows.
 fn most_lanes(tiles: usize, binding: u64) -> usize {
     let counters = (binding / 4).min(1 << 24) as usize;
     (counters / tiles.max(1)).max(8) / 8 * 8
@@ -115,7 +116,7 @@ fn most_lanes(tiles: usize, binding: u64) -> usize {
 /// Bytes per entry of the widest list.
 const ENTRY_BYTES: u64 = 8;
 
-/// Entries that the device binds, and that the lanes of [`TileBinning::Counting`] go through.
+/// Most entries that the device binds and the lanes of [`TileBinning::Counting`] process.
 pub(super) fn most_entries(device: &Device, grouping: TileBinning, tiles: usize) -> usize {
     let binding = device.info().max_storage_range;
     let bound = (binding / ENTRY_BYTES) as usize;

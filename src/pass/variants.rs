@@ -4,17 +4,16 @@ use crate::gpu::{DeviceInfo, NATIVE_FLOAT_ATOMICS};
 /// One of two or more implementations of a pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum KernelVariant {
-    /// Gradients added up by `atomicAdd` on float, where the device has it.
+    /// Native `atomicAdd` on float for the sums of gradients, where the device has it.
     FloatAtomics,
-    /// Gradients of several tiles added up by atomics ([`crate::pass::GradientReduction::Atomics`]), of
-    /// which floats are emulated by a compare-and-swap loop where there are none or they are
-    /// switched off.
+    /// Gradients of several tiles summed by atomics ([`crate::pass::GradientReduction::Atomics`]).
+    /// Without native float atomics a compare-and-swap loop emulates them.
     AtomicGradients,
     /// Gradients stored per tile and summed in order ([`crate::pass::GradientReduction::Entries`]).
     StoredGradients,
     /// Radix sort with a chunk per lane ([`crate::pass::sort::SortAlgorithm::Chunks`]).
     ChunkSort,
-    /// Radix sort in one sweep per digit ([`crate::pass::sort::SortAlgorithm::Sweep`]).
+    /// OneSweep radix sort ([`crate::pass::sort::SortAlgorithm::Sweep`]).
     SweepSort,
     /// Tile lists by counters ([`crate::pass::TileBinning::Counting`]).
     CountedLists,
@@ -99,7 +98,7 @@ mod tests {
         assert_eq!(SortAlgorithm::of(&device), SortAlgorithm::Sweep);
         assert_eq!(SsimRowKernel::of(&device), SsimRowKernel::of(&usual));
         assert!(!device.info().float_atomics);
-        // Both variants are wrong: nothing else is known, `doctor --check` says so.
+        // Both variants are disabled, so neither replaces the other.
         assert_eq!(GradientReduction::of(&device), GradientReduction::of(&usual));
         assert_eq!(TileBinning::of(&device), TileBinning::of(&usual));
         let device = without(&[KernelVariant::AtomicGradients, KernelVariant::CountedLists]);

@@ -1,9 +1,9 @@
-//! The camera as the passes see it: a reference form in f64 and the structure that the shaders read.
+//! Camera of the passes: in f64 for the references, and as the structure that the shaders read.
 use crate::gpu::shaders::structs::CameraView;
 use crate::scene::Camera;
 use glam::{DMat3, DVec3};
 
-/// A pinhole view plus what rasterisation needs to know beside the camera.
+/// Pinhole camera with the near plane and background of a render.
 #[derive(Clone, Debug, PartialEq)]
 pub struct View {
     /// R, world → camera.
@@ -16,11 +16,11 @@ pub struct View {
     pub centre: [f64; 2],
     /// Width and height, pixels.
     pub size: [u32; 2],
-    /// Splats with camera z ≤ near are dropped. World units; 0.01 × the scene's median depth is a
-    /// good value (docs/internals/method.md#projection), because scenes are not metric and may have
-    /// close points.
+    /// Splats with camera z ≤ near are culled. World units; 0.01 × the median depth of the scene is
+    /// a good value (docs/internals/method.md#projection), because scenes are not metric and may
+    /// have close points.
     pub near: f64,
-    /// RGB behind everything.
+    /// RGB of the background.
     pub background: [f64; 3],
 }
 
@@ -44,10 +44,9 @@ impl View {
         self
     }
 
-    /// Largest |t_x/t_z|, |t_y/t_z| that the Jacobian of the projection is evaluated at, towards
-    /// negative and positive coordinates: the image border plus 30 % of the half width. The general
-    /// form of gsplat; for a centred principal point it equals the 1.3·tan(fov/2) of Kerbl et al.
-    /// 2023.
+    /// Limits of |t_x/t_z|, |t_y/t_z| in the Jacobian of the projection, towards negative and
+    /// positive coordinates: the image border plus 30 % of the half width. The general form of
+    /// gsplat; for a centred principal point it equals the 1.3·tan(fov/2) of Kerbl et al. 2023.
     pub fn jacobian_limits(&self) -> ([f64; 2], [f64; 2]) {
         let limit =
             |axis: usize, to_border: f64| (to_border + 0.15 * f64::from(self.size[axis])) / self.focal[axis];
@@ -64,7 +63,7 @@ impl View {
         -(self.rotation.transpose() * self.translation)
     }
 
-    /// What the shaders read.
+    /// Structure that the shaders read.
     pub fn to_gpu(&self) -> CameraView {
         let narrow = |v: [f64; 2]| v.map(|x| x as f32);
         let row = |row: usize| {

@@ -1,4 +1,4 @@
-//! The graph and its schedule.
+//! Graph of stages and its schedule.
 use super::output::{Inputs, Output, Value};
 use super::stage::{Context, Lane, Stage};
 use super::store::{Codec, Key, Store};
@@ -28,14 +28,14 @@ struct Node<'g> {
     save: Save<'g>,
 }
 
-/// Stages and what they need of each other. Stages of one lane start in the order in which they
-/// were added, as far as their inputs allow.
+/// Stages and their inputs. Stages of one lane start in the order in which they were added, as far
+/// as their inputs allow.
 #[derive(Default)]
 pub struct Graph<'g> {
     nodes: Vec<Node<'g>>,
 }
 
-/// What [`Graph::run`] returns: the targets.
+/// Outputs of the targets of [`Graph::run`].
 pub struct Outputs {
     values: Vec<Option<Value>>,
     seconds: Vec<f64>,
@@ -43,29 +43,28 @@ pub struct Outputs {
 }
 
 impl Outputs {
-    /// The output of a target.
+    /// Output of a target.
     pub fn get<T: Send + Sync + 'static>(&self, output: Output<T>) -> Result<Arc<T>> {
         let value = self.values[output.node].clone().and_then(|v| v.downcast::<T>().ok());
         value.ok_or_else(|| Error::work("pipeline: an output was not asked for"))
     }
 
-    /// Seconds that an output took to make, in this process; 0 for what was read from disk.
+    /// Seconds that a stage ran in this process; 0 for outputs read from disk.
     pub fn seconds<T>(&self, output: Output<T>) -> f64 {
         self.seconds[output.node]
     }
 
-    /// Seconds that an output and all that it depends on took to make, one stage after the other,
-    /// in this process.
+    /// Sum of the seconds that a stage and all stages before it ran in this process.
     pub fn seconds_in_all<T>(&self, output: Output<T>) -> f64 {
-        let (mut total, mut asked) = (0.0, BTreeSet::from([output.node]));
-        while let Some(node) = asked.pop_last() {
+        let (mut total, mut pending) = (0.0, BTreeSet::from([output.node]));
+        while let Some(node) = pending.pop_last() {
             total += self.seconds[node];
-            asked.extend(&self.needs[node]);
+            pending.extend(&self.needs[node]);
         }
         total
     }
 
-    /// Takes out the output of a target that no store in memory holds too.
+    /// Takes out the output of a target; an error if a store in memory also holds it.
     pub fn take<T: Send + Sync + 'static>(&mut self, output: Output<T>) -> Result<T> {
         let value = self.get(output);
         self.values[output.node] = None;
@@ -105,8 +104,8 @@ impl<'g> Graph<'g> {
         Output { node: self.nodes.len() - 1, made: PhantomData }
     }
 
-    /// Makes `targets` ([`Output::target`]), reading from `store` what it has and keeping there
-    /// what was made. The first error stops everything.
+    /// Computes `targets` ([`Output::target`]); reads outputs from `store` where it has them and
+    /// keeps new ones there. The first error stops all stages.
     pub fn run(
         &self,
         targets: &[usize],
@@ -133,9 +132,9 @@ impl<'g> Graph<'g> {
         });
         let state = shared.state.into_inner().unwrap_or_else(PoisonError::into_inner);
         if let Err(error) = both(device_lane, processor_lane) {
-            let state_of =
+            let checkpoint_of =
                 |n: usize| store.checkpoint(self.nodes[n].name, &shared.keys[n])?.named(self.nodes[n].name);
-            let begun = (0..self.nodes.len()).rev().find_map(state_of);
+            let begun = (0..self.nodes.len()).rev().find_map(checkpoint_of);
             if !state.kept.is_empty() {
                 let names = state.kept.join(", ");
                 progress.inform(&format!("kept: {names}; the same command with --resume goes on from there"));
@@ -146,9 +145,10 @@ impl<'g> Graph<'g> {
         Ok(Outputs { values: state.values, seconds: state.seconds, needs })
     }
 
+    /// Keys of all stages.
     fn keys(&self, device: &Device, registry: &Registry) -> Vec<Key> {
         let info = device.info();
-        // Without ONNX Runtime no stage gets as far as keeping anything.
+        // Without ONNX Runtime no stage with networks keeps an output.
         let provider = registry.compute().name().unwrap_or_default();
         let machine = format!("{} {} {} {provider}", info.name, info.driver, info.deterministic);
         let mut keys: Vec<Key> = Vec::with_capacity(self.nodes.len());
@@ -160,7 +160,7 @@ impl<'g> Graph<'g> {
         keys
     }
 
-    /// What must be made for the targets, and what the store has of it.
+    /// Initial state: the stages that must run for the targets, and the outputs that the store has.
     fn planned(&self, targets: &[usize], store: &Store, keys: &[Key]) -> State {
         let n = self.nodes.len();
         let mut state = State {
@@ -172,11 +172,11 @@ impl<'g> Graph<'g> {
             kept: Vec::new(),
             failed: false,
         };
-        let mut asked: BTreeSet<usize> = targets.iter().copied().collect();
+        let mut pending: BTreeSet<usize> = targets.iter().copied().collect();
         // Inputs precede the stages that need them.
-        while let Some(node) = asked.pop_last() {
+        while let Some(node) = pending.pop_last() {
             if let Some(value) = store.memory_get(&keys[node]) {
-                // Its warnings were given in this process.
+                // This process has given its warnings.
                 state.values[node] = Some(value);
             } else if let Some((warnings, value)) = (self.nodes[node].load)(store, &keys[node]) {
                 (state.warnings[node], state.values[node]) = (warnings, Some(value));
@@ -185,7 +185,7 @@ impl<'g> Graph<'g> {
                 state.waiting.insert(node);
                 for &need in &self.nodes[node].needs {
                     state.users[need] += 1;
-                    asked.insert(need);
+                    pending.insert(need);
                 }
             }
         }
@@ -193,7 +193,7 @@ impl<'g> Graph<'g> {
         state
     }
 
-    /// Names the stages that need not run, and repeats what was warned of when they did.
+    /// Reports the stages that need not run, and repeats their warnings.
     fn report_kept(&self, state: &State, progress: &dyn Progress) {
         if !state.kept.is_empty() {
             progress.inform(&format!("kept from an earlier run: {}", state.kept.join(", ")));
@@ -204,7 +204,7 @@ impl<'g> Graph<'g> {
     }
 }
 
-/// Checksum of the running program: another build may work differently.
+/// Checksum of the running program: the outputs of another build may differ.
 fn program() -> &'static str {
     static PROGRAM: OnceLock<String> = OnceLock::new();
     PROGRAM.get_or_init(|| {
@@ -213,16 +213,16 @@ fn program() -> &'static str {
     })
 }
 
-/// How far the graph is.
+/// State of a running graph.
 struct State {
-    /// Stages that must still start.
+    /// Stages that have not started.
     waiting: BTreeSet<usize>,
     values: Vec<Option<Value>>,
-    /// That each took to make, here or in an earlier graph of the store.
+    /// Seconds that each stage ran, here or in an earlier graph of the store.
     seconds: Vec<f64>,
-    /// What was warned of while each was made, and its inputs.
+    /// Warnings of each stage and of its inputs.
     warnings: Vec<Vec<String>>,
-    /// Stages that must still run, and targets, that each output serves: without one it is dropped.
+    /// Number of pending stages and targets that use each output; it is dropped at 0.
     users: Vec<usize>,
     /// Stages whose output is on disk now.
     kept: Vec<&'static str>,
@@ -242,35 +242,35 @@ impl Shared<'_, '_> {
         lock(&self.state)
     }
 
-    /// Runs the stages of a lane until none is left or one has failed anywhere.
+    /// Runs the stages of a lane until none is left or a stage of any lane has failed.
     fn work(&self, lane: Lane, context: &Context, progress: &Recorded) -> Result<()> {
-        // Also when a stage panics.
+        // Stops the other lane also when a stage panics.
         let guard = StopOnDrop { shared: self, progress };
         while let Some((node, inputs)) = self.next(lane) {
-            let at = &self.graph.nodes[node];
-            let work = lock(&at.work).take();
+            let stage = &self.graph.nodes[node];
+            let work = lock(&stage.work).take();
             let work = work.ok_or_else(|| Error::work("pipeline: a graph runs once"))?;
-            let checkpoint = self.store.checkpoint(at.name, &self.keys[node]);
+            let checkpoint = self.store.checkpoint(stage.name, &self.keys[node]);
             let recorder =
                 WarningRecorder { inner: context.progress, warnings: Mutex::default(), checkpoint };
             let began = Instant::now();
-            let state = || recorder.checkpoint.as_ref().and_then(|c| c.named(at.name));
+            let kept_state = || recorder.checkpoint.as_ref().and_then(|c| c.named(stage.name));
             let value = work(&inputs, &Context { progress: &recorder, ..*context })
-                .map_err(|error| error.keeping(state()))?;
+                .map_err(|error| error.keeping(kept_state()))?;
             drop(inputs);
             let mut warnings = lock(&recorder.warnings).clone();
-            // Those of its inputs as well: with its output kept they need not be read again.
-            warnings.splice(0..0, at.needs.iter().flat_map(|n| self.lock().warnings[*n].clone()));
+            // With the warnings of its inputs, which a resumed run does not read.
+            warnings.splice(0..0, stage.needs.iter().flat_map(|n| self.lock().warnings[*n].clone()));
             let seconds = began.elapsed().as_secs_f64();
-            self.store.memory_put(at.name, &self.keys[node], &value, seconds);
+            self.store.memory_put(stage.name, &self.keys[node], &value, seconds);
             let warn = |text: &str| context.progress.warn(text);
-            let kept = (at.save)(self.store, &self.keys[node], &warnings, &value, &warn)?;
+            let kept = (stage.save)(self.store, &self.keys[node], &warnings, &value, &warn)?;
             recorder.checkpoint.iter().for_each(Checkpoint::remove);
             let mut state = self.lock();
-            state.kept.extend(kept.then_some(at.name));
+            state.kept.extend(kept.then_some(stage.name));
             (state.values[node], state.seconds[node]) = (Some(value), seconds);
             state.warnings[node] = warnings;
-            for &need in &at.needs {
+            for &need in &stage.needs {
                 state.users[need] -= 1;
                 if state.users[need] == 0 {
                     state.values[need] = None;
@@ -278,24 +278,23 @@ impl Shared<'_, '_> {
             }
             self.changed.notify_all();
         }
-        // The lane is done, or the other one has failed and has set the flag.
+        // The lane is done, or the other lane has failed and set the flag.
         std::mem::forget(guard);
         Ok(())
     }
 
-    /// The first stage of the lane whose inputs are there, waiting for them; `None` when no more
-    /// will come.
+    /// Waits for the first stage of the lane with all inputs; `None` when no more will run.
     fn next(&self, lane: Lane) -> Option<(usize, Vec<Value>)> {
         let mut state = self.lock();
         loop {
-            let of_lane = |n: &&usize| self.graph.nodes[**n].lane == lane;
-            if state.failed || !state.waiting.iter().any(|n| of_lane(&n)) {
+            let in_lane = |n: &&usize| self.graph.nodes[**n].lane == lane;
+            if state.failed || !state.waiting.iter().any(|n| in_lane(&n)) {
                 return None;
             }
             let inputs = |n: &usize| -> Option<Vec<Value>> {
                 self.graph.nodes[*n].needs.iter().map(|need| state.values[*need].clone()).collect()
             };
-            let ready = state.waiting.iter().filter(of_lane).find_map(|n| Some((*n, inputs(n)?)));
+            let ready = state.waiting.iter().filter(in_lane).find_map(|n| Some((*n, inputs(n)?)));
             if let Some((node, inputs)) = ready {
                 state.waiting.remove(&node);
                 return Some((node, inputs));
@@ -305,7 +304,7 @@ impl Shared<'_, '_> {
     }
 }
 
-/// Passes everything on and keeps the warnings.
+/// Progress that forwards all calls and keeps the warnings.
 struct WarningRecorder<'a> {
     inner: &'a dyn Progress,
     warnings: Mutex<Vec<String>>,
@@ -357,7 +356,7 @@ impl Drop for StopOnDrop<'_, '_> {
     }
 }
 
-/// The results of two lanes; of two errors the one that is not the mere consequence of the other.
+/// Results of two lanes; of two errors the cause, not the cancellation that follows from it.
 fn both<A, B>(device: Result<A>, processor: Result<B>) -> Result<(A, B)> {
     match (device, processor) {
         (Ok(a), Ok(b)) => Ok((a, b)),

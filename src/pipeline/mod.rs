@@ -1,6 +1,6 @@
-//! Work as a graph of stages: each declares its inputs, its output and what that depends on; when a
-//! stage may run, beside which others, and whether its output is still there from an earlier run
-//! follows from that.
+//! Work as a graph of stages. Each declares its inputs, its output and the dependencies of the
+//! output. The graph derives when a stage may run, which stages run in parallel, and whether an
+//! output of an earlier run is still valid.
 mod graph;
 mod output;
 mod stage;

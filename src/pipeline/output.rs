@@ -3,10 +3,10 @@ use std::any::Any;
 use std::marker::PhantomData;
 use std::sync::Arc;
 
-/// An output as graphs pass it on.
+/// Output of any type, as graphs pass it on.
 pub(super) type Value = Arc<dyn Any + Send + Sync>;
 
-/// What a stage of a graph will make.
+/// Handle of the output of a stage in a graph.
 pub struct Output<T> {
     pub(super) node: usize,
     pub(super) made: PhantomData<fn() -> T>,
@@ -22,11 +22,11 @@ impl<T> Copy for Output<T> {}
 
 /// Tuples of [`Output`]s.
 pub trait Inputs {
-    /// References to what was made.
+    /// References to the outputs.
     type Values<'v>;
-    /// The stages that make them.
+    /// Indices of the stages that make them.
     fn nodes(&self) -> Vec<usize>;
-    /// What was made, in the order of [`Inputs::nodes`]; `None` if that is something else.
+    /// Outputs in the order of [`Inputs::nodes`]; `None` if a type does not match.
     fn values(made: &[Value]) -> Option<Self::Values<'_>>;
 }
 
@@ -51,7 +51,7 @@ inputs!(A 0, B 1, C 2);
 inputs!(A 0, B 1, C 2, D 3);
 
 impl<T> Output<T> {
-    /// For [`super::Graph::run`].
+    /// Target for [`super::Graph::run`].
     pub fn target(self) -> usize {
         self.node
     }

@@ -1,4 +1,4 @@
-//! The interface of a stage.
+//! Interface of a stage.
 use super::output::Inputs;
 use super::store::Codec;
 use crate::Result;
@@ -6,24 +6,24 @@ use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::progress::Progress;
 
-/// What a stage works with besides its inputs.
+/// Environment of a running stage.
 #[derive(Clone, Copy)]
 pub struct Context<'a> {
-    /// The device of everything that computes on one.
+    /// Device for all GPU work.
     pub device: &'a Device,
-    /// Where models are found.
+    /// Registry of models.
     pub registry: &'a Registry,
-    /// Where the stage reports, and learns that it should stop.
+    /// Receives reports of the stage and carries requests to stop.
     pub progress: &'a dyn Progress,
 }
 
-/// What a stage keeps busy. One stage of each kind runs at a time: two on one device would only
-/// wait for each other.
+/// Resource that a stage keeps busy. One stage per lane runs at a time: two on one device would
+/// only wait for each other.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Lane {
-    /// The Vulkan device, and the processor where cameras are found: what everything else waits
-    /// for.
+    /// The Vulkan device, and the processor while cameras are found, for which all other stages
+    /// wait.
     Device,
     /// The processor: masks, features, words.
     Processor,
@@ -31,25 +31,24 @@ pub enum Lane {
 
 /// One step of the work, with its settings.
 pub trait Stage: Send {
-    /// As error messages and the store call it.
+    /// Name in error messages and in the store.
     const NAME: &'static str;
-    /// What it keeps busy.
+    /// Resource that it keeps busy.
     const LANE: Lane;
     /// Outputs of other stages, a tuple of [`super::Output`]s.
     type Inputs: Inputs;
-    /// What it makes.
+    /// Type of its output.
     type Output: Send + Sync + 'static;
 
-    /// Everything that the output depends on besides the inputs, the program, what computes
-    /// networks and, on the device's lane, the device: options, seeds, checksums of models and
-    /// files.
+    /// Dependencies of the output besides the inputs, the program, the provider of networks and, on
+    /// [`Lane::Device`], the device: options, seeds, checksums of models and files.
     fn settings(&self) -> String;
 
-    /// How the output is kept on disk; `None` for what is made again sooner than read.
+    /// Codec of the output on disk; `None` where computing it again is faster than reading it.
     fn codec() -> Option<Codec<Self::Output>> {
         None
     }
 
-    /// Does the work. It begins and ends its own steps of progress.
+    /// Does the work; begins and ends its own steps of progress.
     fn run(self, inputs: <Self::Inputs as Inputs>::Values<'_>, context: &Context) -> Result<Self::Output>;
 }

@@ -1,4 +1,4 @@
-//! Outputs of stages on disk, by everything that they depend on.
+//! Outputs of stages on disk and in memory, by their dependencies.
 use super::output::Value;
 use crate::checkpoint::Checkpoint;
 use crate::error::words;
@@ -14,18 +14,18 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-/// Bytes that the folder may hold: the stages of some twenty scenes of four photos.
+/// Most bytes in the folder: the stages of some twenty scenes of four photos.
 const CAPACITY: u64 = 4 << 30;
 
 /// Extension of the files.
 const EXTENSION: &str = "stage";
 
-/// Identifies an output by everything that it depends on.
+/// Checksum of all dependencies of an output.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Key(String);
 
 impl Key {
-    /// From the stage's name, what it depends on, and the keys of its inputs.
+    /// Key from the name of a stage, its settings, and the keys of its inputs.
     pub(super) fn of(name: &str, settings: &[&str], inputs: &[&Key]) -> Key {
         let mut digest = Sha256::new();
         let all = std::iter::once(&name).chain(settings).copied().chain(inputs.iter().map(|k| k.0.as_str()));
@@ -33,20 +33,20 @@ impl Key {
             digest.update((text.len() as u64).to_le_bytes());
             digest.update(text);
         }
-        // The number of settings is fixed, that of inputs is not.
+        // The number of settings is fixed, so the inputs need no separator.
         Key(files::hex(&digest.finalize())[..32].to_owned())
     }
 }
 
-/// Turns outputs into bytes and back.
+/// Conversion of outputs to bytes and back.
 pub struct Codec<T> {
-    /// To bytes.
+    /// Writes an output to bytes.
     pub write: fn(&T) -> Result<Vec<u8>>,
-    /// Back; `None` where the bytes are not such an output.
+    /// Reads an output; `None` where the bytes are invalid.
     pub read: fn(&[u8]) -> Option<T>,
 }
 
-/// The codec of everything that serde can write.
+/// Codec of every type that serde can write.
 pub fn kept<T: Serialize + DeserializeOwned>() -> Option<Codec<T>> {
     let write = |value: &T| postcard::to_stdvec(value).map_err(unwritable);
     Some(Codec { write, read: |bytes| postcard::from_bytes(bytes).ok() })
@@ -56,47 +56,47 @@ fn unwritable(e: postcard::Error) -> Error {
     Error::work(format!("stage store: {e}"))
 }
 
-/// Outputs by everything that they depend on. In a folder, any odd file is made again and written
-/// over.
+/// Outputs by their [`Key`]. Damaged files of a folder are computed again and overwritten.
 #[derive(Default)]
 pub struct Store {
     folder: Option<PathBuf>,
     resume: bool,
     every: Duration,
+    /// Stages whose outputs are not kept in memory.
     passing: &'static [&'static str],
     memory: Option<Mutex<BTreeMap<String, Made>>>,
-    /// Whether it was said that outputs are not kept.
-    told: AtomicBool,
+    /// Whether the warning was given that outputs are not kept.
+    warned: AtomicBool,
 }
 
 /// An output in memory.
 struct Made {
-    /// Gone once [`Store::forget_unused`] or the rules of the store say so.
+    /// `None` after [`Store::forget_unused`], or where the store does not keep the stage.
     value: Option<Value>,
-    /// That it took to make.
+    /// Seconds that the stage ran.
     seconds: f64,
-    /// Since [`Store::forget_unused`] was last called.
+    /// Whether a graph used it since the last [`Store::forget_unused`].
     used: bool,
 }
 
 impl Store {
-    /// Keeps nothing.
+    /// A store that keeps nothing.
     pub fn none() -> Store {
         Store::default()
     }
 
-    /// Keeps every output of the graphs that run with it, as long as it lives or until
-    /// [`Store::forget_unused`].
+    /// A store in memory of every output of its graphs, until [`Store::forget_unused`].
     pub fn in_memory() -> Store {
         Store { memory: Some(Mutex::default()), ..Store::default() }
     }
 
-    /// The same without the outputs of these stages: large ones that no other graph needs.
+    /// [`Store::in_memory`] without the outputs of these stages: large ones that no other graph
+    /// needs.
     pub fn in_memory_without(stages: &'static [&'static str]) -> Store {
         Store { passing: stages, ..Store::in_memory() }
     }
 
-    /// Drops from memory what no graph has used since this was last called.
+    /// Drops from memory the outputs that no graph has used since the last call.
     pub fn forget_unused(&self) {
         let Some(memory) = &self.memory else { return };
         for made in lock(memory).values_mut() {
@@ -106,13 +106,13 @@ impl Store {
         }
     }
 
-    /// Keeps outputs in `folder`, and the state of training every so often; with `resume` what is
-    /// there is used.
+    /// A store in `folder`, which also keeps the state of training at the interval `every`; with
+    /// `resume`, graphs read the files that are there.
     pub fn at(folder: impl Into<PathBuf>, resume: bool, every: Duration) -> Store {
         Store { folder: Some(folder.into()), resume, every, ..Store::default() }
     }
 
-    /// What this process has made.
+    /// Output in memory, if this store has it.
     pub(super) fn memory_get(&self, key: &Key) -> Option<Value> {
         let mut memory = lock(self.memory.as_ref()?);
         let made = memory.get_mut(&key.0)?;
@@ -120,13 +120,13 @@ impl Store {
         made.value.clone()
     }
 
-    /// Seconds that it took, if this process has made it in this store; 0 otherwise.
+    /// Seconds that the stage ran in this process; 0 otherwise.
     pub(super) fn seconds(&self, key: &Key) -> f64 {
         let memory = self.memory.as_ref().map(|m| lock(m));
         memory.and_then(|m| m.get(&key.0).map(|made| made.seconds)).unwrap_or(0.0)
     }
 
-    /// Keeps it for [`Store::memory_get`], in a store that does.
+    /// Keeps an output for [`Store::memory_get`], in a store in memory.
     pub(super) fn memory_put(&self, name: &str, key: &Key, value: &Value, seconds: f64) {
         if let Some(memory) = &self.memory {
             let value = (!self.passing.contains(&name)).then(|| value.clone());
@@ -135,7 +135,7 @@ impl Store {
         }
     }
 
-    /// Where a stage keeps its state while it works.
+    /// Checkpoint of a running stage.
     pub(super) fn checkpoint(&self, name: &str, key: &Key) -> Option<Checkpoint> {
         let file = Store::file(self.folder.as_ref()?, &format!("{name}-state"), key);
         Some(Checkpoint::new(file, self.every, self.resume))
@@ -145,7 +145,7 @@ impl Store {
         folder.join(format!("{name}-{}.{EXTENSION}", key.0))
     }
 
-    /// What was warned of while it was made, and the output.
+    /// Reads an output with the warnings that were given while it was made.
     pub(super) fn load<T>(&self, name: &str, key: &Key, codec: &Codec<T>) -> Option<(Vec<String>, T)> {
         let folder = self.folder.as_ref().filter(|_| self.resume)?;
         let bytes = files::read_with_checksum(&Store::file(folder, name, key))?;
@@ -153,8 +153,8 @@ impl Store {
         Some((warnings, (codec.read)(body)?))
     }
 
-    /// Whether it is there now: a disk that is full costs the next run time, not this one its
-    /// result. `warn` gets the first reason why one is not.
+    /// Writes an output and returns whether it succeeded: a full disk costs the next run time, but
+    /// not this run its result. `warn` gets the first reason of a failure.
     pub(super) fn save<T>(
         &self,
         name: &str,
@@ -171,7 +171,7 @@ impl Store {
         let written = files::write_with_checksum(&file, &body);
         match &written {
             Ok(()) => files::prune(&file, EXTENSION, CAPACITY),
-            Err(_) if self.told.swap(true, Ordering::Relaxed) => {}
+            Err(_) if self.warned.swap(true, Ordering::Relaxed) => {}
             Err(e) => warn(&format!(
                 "stages are not kept, so that --resume will find nothing: {}: {}",
                 folder.display(),
@@ -181,7 +181,7 @@ impl Store {
         Ok(written.is_ok())
     }
 
-    /// What is kept in a folder, with sizes in bytes.
+    /// Kept files of a folder, with sizes in bytes.
     pub fn list(folder: &Path) -> Vec<(PathBuf, u64)> {
         files::in_folder(folder, EXTENSION)
     }

@@ -1,4 +1,4 @@
-//! Graphs of small stages: what runs, in parallel to what, and what is not run again.
+//! Tests with graphs of small stages: schedule, parallel lanes, reuse of outputs.
 use super::*;
 use crate::Error;
 use crate::Result;
@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
 use std::time::Duration;
 
-/// Adds to what it gets, and counts.
+/// Adds to its input, and counts runs.
 struct Add {
     by: u64,
     runs: Arc<AtomicUsize>,
@@ -34,7 +34,7 @@ impl Stage for Add {
     }
 }
 
-/// A number that is made again each time, on the other lane.
+/// A number without a codec, on the other lane.
 struct Number(u64, Arc<AtomicUsize>);
 
 impl Stage for Number {
@@ -69,7 +69,7 @@ impl Machine {
     }
 }
 
-/// number → + 1 → + `last`; the runs of each, the result, and the warnings.
+/// Runs number → + 1 → + `last`; the runs of each, the result, and the warnings.
 fn chain(machine: &Machine, store: &Store, last: u64) -> ([usize; 3], u64, Vec<String>) {
     let runs: [Arc<AtomicUsize>; 3] = Default::default();
     let mut graph = Graph::default();
@@ -82,11 +82,11 @@ fn chain(machine: &Machine, store: &Store, last: u64) -> ([usize; 3], u64, Vec<S
 }
 
 #[test]
-fn finished_stages_are_not_run_again_and_their_warnings_stay() {
+fn finished_stages_are_not_run_again() {
     let (machine, folder) = (Machine::new(), tempfile::tempdir().unwrap());
     let kept = |resume| Store::at(folder.path(), resume, TIMEOUT);
     assert_eq!(chain(&machine, &kept(true), 2).0, [1, 1, 1]);
-    // Without asking for it everything runs.
+    // Without `resume` all stages run.
     assert_eq!(chain(&machine, &kept(false), 2).0, [1, 1, 1]);
     let (runs, value, warnings) = chain(&machine, &kept(true), 2);
     assert_eq!((runs, value), ([0, 0, 0], 8));
@@ -95,7 +95,7 @@ fn finished_stages_are_not_run_again_and_their_warnings_stay() {
     let (runs, value, warnings) = chain(&machine, &kept(true), 3);
     assert_eq!((runs, value), ([0, 0, 1], 9));
     assert_eq!(warnings, ["a number", "one more"]);
-    // A damaged file is as good as none.
+    // Damaged files are not used.
     for (file, _) in Store::list(folder.path()) {
         let mut bytes = std::fs::read(&file).unwrap();
         *bytes.last_mut().unwrap() ^= 1;
@@ -104,8 +104,7 @@ fn finished_stages_are_not_run_again_and_their_warnings_stay() {
     assert_eq!(chain(&machine, &kept(true), 3).0, [1, 1, 1]);
     let list = Store::list(folder.path());
     assert!(list.len() == 3 && list.iter().all(|(_, bytes)| *bytes > 64), "{list:?}");
-    // Once the folder is full, what was not used for longest goes. 4 GiB of zeros take no space on
-    // a disk.
+    // In a full folder, the least recently used file is removed. 4 GiB of zeros take no disk space.
     let old = folder.path().join("old.stage");
     let file = std::fs::File::create(&old).unwrap();
     file.set_len(4 << 30).unwrap();
@@ -114,34 +113,36 @@ fn finished_stages_are_not_run_again_and_their_warnings_stay() {
     assert!(!old.exists() && Store::list(folder.path()).len() == 3);
 }
 
-/// A folder that is not the program's own is in the way of every file.
+/// Path of a file while it is written.
+fn partial_path(file: &std::path::Path) -> std::path::PathBuf {
+    let name = file.file_name().unwrap().to_string_lossy().into_owned();
+    file.with_file_name(format!(".{name}.partial-splatvk"))
+}
+
+/// A folder blocks every partial file.
 #[test]
-fn a_store_that_cannot_be_written_costs_the_next_run_time() {
+fn unwritable_store_keeps_the_result() {
     let (machine, folder) = (Machine::new(), tempfile::tempdir().unwrap());
     let kept = || Store::at(folder.path(), true, TIMEOUT);
     assert_eq!(chain(&machine, &kept(), 2).0, [1, 1, 1]);
     let files: Vec<_> = Store::list(folder.path()).into_iter().map(|f| f.0).collect();
-    let in_the_way = |file: &std::path::PathBuf| {
-        let name = file.file_name().unwrap().to_string_lossy().into_owned();
-        file.with_file_name(format!(".{name}.partial-splatvk"))
-    };
     for file in &files {
         std::fs::remove_file(file).unwrap();
-        std::fs::create_dir(in_the_way(file)).unwrap();
-        std::fs::write(in_the_way(file).join("letter"), "precious").unwrap();
+        std::fs::create_dir(partial_path(file)).unwrap();
+        std::fs::write(partial_path(file).join("letter"), "precious").unwrap();
     }
     let (runs, value, _) = chain(&machine, &kept(), 2);
     assert_eq!((runs, value), ([1, 1, 1], 8));
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), files.len(), "nothing half-written stays");
-    // It is out of the way.
-    files.iter().for_each(|file| std::fs::remove_dir_all(in_the_way(file)).unwrap());
+    // Without the folders the store is written.
+    files.iter().for_each(|file| std::fs::remove_dir_all(partial_path(file)).unwrap());
     assert_eq!(chain(&machine, &kept(), 2).0, [1, 1, 1]);
     assert_eq!(chain(&machine, &kept(), 2).0, [0, 0, 0]);
     assert_eq!(Store::list(folder.path()).len(), files.len());
 }
 
 #[test]
-fn graphs_of_one_store_in_memory_share_their_stages() {
+fn graphs_of_one_store_share_outputs() {
     let (machine, store) = (Machine::new(), Store::in_memory());
     let (runs, value, warnings) = chain(&machine, &store, 2);
     assert_eq!((runs, value, warnings.len()), ([1, 1, 1], 8, 2));
@@ -154,11 +155,11 @@ fn graphs_of_one_store_in_memory_share_their_stages() {
 }
 
 #[test]
-fn a_store_in_memory_forgets_what_a_round_has_not_used_and_what_only_passes() {
+fn store_in_memory_forgets_unused_outputs() {
     let (machine, store) = (Machine::new(), Store::in_memory());
     assert_eq!(chain(&machine, &store, 2).0, [1, 1, 1]);
     store.forget_unused();
-    // The last stage differs: number and its successor serve this round too, 5 + 1 + 2 does not.
+    // The last stage differs: this round uses the number and its successor, but not 5 + 1 + 2.
     assert_eq!(chain(&machine, &store, 3).0, [0, 0, 1]);
     store.forget_unused();
     assert_eq!(chain(&machine, &store, 3).0, [0, 0, 0]);
@@ -167,7 +168,7 @@ fn a_store_in_memory_forgets_what_a_round_has_not_used_and_what_only_passes() {
     assert_eq!(chain(&machine, &passing, 2).0, [1, 1, 1]);
     assert_eq!(chain(&machine, &passing, 2).0, [0, 0, 0]);
     assert_eq!(chain(&machine, &passing, 3).0, [0, 0, 1], "the sum before it was kept");
-    // One "number" of a store that keeps nothing else of it runs for whoever asks for it.
+    // A "number" that the store does not keep runs where it is a target.
     let graph = |by| {
         let runs = Arc::new(AtomicUsize::new(0));
         let mut graph = Graph::default();
@@ -180,7 +181,7 @@ fn a_store_in_memory_forgets_what_a_round_has_not_used_and_what_only_passes() {
     assert_eq!((graph(7), graph(8)), (1, 1));
 }
 
-/// Sends to the other stage, then waits for its message.
+/// Sends a message to the other stage, then waits for its message.
 struct Handshake {
     receive: Option<mpsc::Receiver<()>>,
     send: Option<mpsc::Sender<()>>,
@@ -229,7 +230,7 @@ fn pair(ends: [fn(&Context) -> Result<()>; 2]) -> Result<()> {
     machine.run(&graph, &[device.target(), processor.target()], &Store::none()).map(|_| ())
 }
 
-/// Until it is told to stop.
+/// Runs until the progress is cancelled.
 fn long(context: &Context) -> Result<()> {
     let started = std::time::Instant::now();
     while started.elapsed() < TIMEOUT {
@@ -240,7 +241,7 @@ fn long(context: &Context) -> Result<()> {
 }
 
 #[test]
-fn lanes_work_in_parallel_and_the_cause_of_a_stop_is_reported() {
+fn parallel_lanes_report_the_first_error() {
     pair([|_| Ok(()), |_| Ok(())]).unwrap();
     let error = |ends| pair(ends).unwrap_err().to_string();
     assert_eq!(error([long, |_| Err(Error::input("bad mask"))]), "bad mask");

@@ -1,13 +1,14 @@
-//! Names of files without the folders that only this machine has: a report is passed on.
+//! Removal of local folders from file names, since reports are shared.
 use serde_json::Value;
 use std::path::{MAIN_SEPARATOR, Path};
 
-/// Takes the folders of the paths that a user typed out of all texts: `/home/me/photos/a.jpg`
-/// becomes `photos/a.jpg` where `/home/me/photos` was typed, and `a.jpg` where it was typed itself.
+/// Removes the parent folders of the paths that a user typed from all texts:
+/// `/home/me/photos/a.jpg` becomes `photos/a.jpg` where `/home/me/photos` was typed, and `a.jpg`
+/// where it was typed itself.
 pub(super) fn bare<'a>(value: &mut Value, typed: impl IntoIterator<Item = &'a Path>) {
     let folder = |path: &Path| Some(path.parent()?.to_string_lossy().into_owned());
     let mut folders: Vec<String> = typed.into_iter().filter_map(folder).filter(|f| !f.is_empty()).collect();
-    // A folder within another one goes first, as a whole.
+    // Nested folders are removed first, as a whole.
     folders.sort_by_key(|f| std::cmp::Reverse(f.len()));
     folders.dedup();
     for folder in &mut folders {
@@ -27,13 +28,13 @@ fn walk(value: &mut Value, folders: &[String]) {
     }
 }
 
-/// A text without a folder's name wherever a path begins with it.
+/// Removes the name of a folder from a text wherever a path begins with it.
 fn without(text: &str, folder: &str) -> String {
     let mut left = String::with_capacity(text.len());
     let mut pieces = text.split(folder);
     left.extend(pieces.next());
     for piece in pieces {
-        // Within a name it is another folder, of the same name.
+        // Inside a longer path it is another folder of the same name.
         if !left.chars().next_back().is_none_or(|c| c.is_whitespace() || "\"'“‘(:,;=".contains(c)) {
             left.push_str(folder);
         }
@@ -47,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn folders_of_typed_paths_are_left_out() {
+    fn bare_removes_folders_of_typed_paths() {
         let typed = ["/home/me/photos", "/home/me/more/b.jpg", "../up/scene", "here", "a/deep/masks"];
         let mut value = serde_json::json!({
             "inputs": ["/home/me/photos", "/home/me/more/b.jpg"], "out": "../up/scene", "masks": "dir:a/deep/masks", "n": 3,

@@ -6,7 +6,7 @@ const HEIGHT: f64 = 200.0;
 const LEFT: f64 = 44.0;
 const BOTTOM: f64 = 30.0;
 
-/// A step of 1, 2 or 5 times a power of ten that cuts `span` into at most `most` parts.
+/// Step of 1, 2 or 5 times a power of ten that divides `span` into at most `most` parts.
 fn nice_step(span: f64, most: f64) -> f64 {
     let raw = (span / most).max(1e-9);
     let power = 10f64.powf(raw.log10().floor());
@@ -14,7 +14,7 @@ fn nice_step(span: f64, most: f64) -> f64 {
     factor * power
 }
 
-/// A curve of (x, y) with axis labels; empty without at least two finite points.
+/// Chart of a curve (x, y) with axis labels; empty without at least two finite points.
 pub fn line_chart(points: &[(f64, f64)], x_label: &str, y_label: &str) -> String {
     let points: Vec<_> = points.iter().filter(|p| p.0.is_finite() && p.1.is_finite()).collect();
     if points.len() < 2 {
@@ -62,19 +62,19 @@ pub fn line_chart(points: &[(f64, f64)], x_label: &str, y_label: &str) -> String
 /// One bar of [`bar_chart`].
 #[derive(Clone, Debug)]
 pub struct Bar {
-    /// Bars of one group stand together under its name.
+    /// Name above the bars of a group.
     pub group: String,
-    /// Left of the bar.
+    /// Label left of the bar.
     pub label: String,
-    /// In [0, 1].
+    /// Value in [0, 1].
     pub value: f64,
     /// Standard deviation, drawn to both sides of the end of the bar.
     pub error: Option<f64>,
-    /// A tick to compare with.
+    /// Value of a tick to compare with.
     pub reference: Option<f64>,
 }
 
-/// Horizontal bars of values in [0, 1], a file of its own; empty without bars.
+/// Chart of horizontal bars of values in [0, 1], as a complete SVG file; empty without bars.
 pub fn bar_chart(bars: &[Bar], title: &str) -> String {
     const ROW: f64 = 22.0;
     const BAR_LEFT: f64 = 210.0;
@@ -139,7 +139,7 @@ pub fn bar_chart(bars: &[Bar], title: &str) -> String {
     )
 }
 
-/// Text as HTML and SVG show it.
+/// Escapes a text for HTML and SVG.
 pub(super) fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
@@ -149,7 +149,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_curve_stays_inside_and_ends_where_it_should() {
+    fn line_chart_stays_inside_its_axes() {
         let svg = line_chart(&[(0.0, 12.5), (100.0, 20.0), (f64::NAN, 1.0), (300.0, 31.5)], "step", "dB");
         let d = svg.split("class=\"line\" d=\"M").nth(1).unwrap().split('"').next().unwrap();
         let xy: Vec<Vec<f64>> =
@@ -161,12 +161,12 @@ mod tests {
     }
 
     #[test]
-    fn steps_are_one_two_or_five() {
+    fn nice_step_is_round() {
         assert_eq!([nice_step(10.0, 5.0), nice_step(19.0, 5.0), nice_step(1000.0, 6.0)], [2.0, 5.0, 200.0]);
     }
 
     #[test]
-    fn bars_are_as_long_as_their_values_and_text_is_escape() {
+    fn bar_chart_lengths_match_values() {
         let bar = |label: &str, value, error, reference| Bar {
             group: "g".into(),
             label: label.into(),
@@ -184,8 +184,8 @@ mod tests {
         assert!(
             (widths[1] / widths[0] - 2.0).abs() < 0.01 && svg.contains("a&lt;b") && svg.contains("stroke")
         );
-        // The whole width is that of a bar of 1; the line reaches as far beyond the end of its own
-        // as before it.
+        // The bar of value 1 has the full width; the error line is symmetric about the end of its
+        // bar.
         let line = svg.split("<path d=\"M").find(|p| p.contains("#222")).unwrap();
         let ends: Vec<f64> = line.split(['M', 'H', ' ', 'v']).filter_map(|v| v.parse().ok()).collect();
         assert!((ends[2] - ends[0] - 0.5 * widths[1]).abs() < 0.2, "{ends:?} {widths:?}");

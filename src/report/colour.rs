@@ -1,19 +1,19 @@
-//! Values to colours: depth, heat, labels.
+//! Colour maps of depth, relevancy and labels.
 use crate::scene::{Image, RgbImage};
 
-/// Turbo (Mikhailov 2019): the published polynomial fit of the colour map, [0, 1] → sRGB.
+/// Turbo colour map (Mikhailov 2019) by its published polynomial fit, [0, 1] → sRGB.
 pub fn turbo(v: f32) -> [f32; 3] {
     let x = if v.is_nan() { 0.0 } else { v.clamp(0.0, 1.0) };
-    let poly = |c: [f32; 6]| c.iter().rev().fold(0.0, |sum, k| sum * x + k).clamp(0.0, 1.0);
+    let polynomial = |c: [f32; 6]| c.iter().rev().fold(0.0, |sum, k| sum * x + k).clamp(0.0, 1.0);
     [
-        poly([0.135_721_38, 4.615_392_6, -42.660_32, 132.131_08, -152.942_4, 59.286_38]),
-        poly([0.091_402_61, 2.194_188_4, 4.842_966_6, -14.185_033, 4.277_298_6, 2.829_566]),
-        poly([0.106_673_3, 12.641_946, -60.582_05, 110.362_77, -89.903_11, 27.348_25]),
+        polynomial([0.135_721_38, 4.615_392_6, -42.660_32, 132.131_08, -152.942_4, 59.286_38]),
+        polynomial([0.091_402_61, 2.194_188_4, 4.842_966_6, -14.185_033, 4.277_298_6, 2.829_566]),
+        polynomial([0.106_673_3, 12.641_946, -60.582_05, 110.362_77, -89.903_11, 27.348_25]),
     ]
 }
 
-/// A colour per label that differs from its neighbours': hues a golden angle apart; negative labels
-/// are dark grey.
+/// Colour of a label, distinct from the colours of near indices: hues a golden angle apart;
+/// negative labels are dark grey.
 pub fn label(index: i32) -> [f32; 3] {
     if index < 0 {
         return [0.13; 3];
@@ -29,14 +29,14 @@ pub fn label(index: i32) -> [f32; 3] {
     [channel(5.0), channel(3.0), channel(1.0)]
 }
 
-/// Depth, near = warm; unknown (≤ 0) = black. The range is that of the central 98 %, so that one
-/// stray pixel does not flatten the rest.
+/// Colours of depth: near = warm, unknown (≤ 0) = black. The range is that of the central 98 %, so
+/// that outliers do not flatten it.
 pub fn depth_image(depth: &Image<f32>) -> RgbImage {
     let mut known: Vec<f32> = depth.data.iter().copied().filter(|z| *z > 0.0 && z.is_finite()).collect();
     known.sort_by(f32::total_cmp);
     let quantile =
         |q: f64| known.get(((known.len() as f64 - 1.0) * q).round() as usize).copied().unwrap_or(1.0);
-    // Inverse depth, as image motion follows it.
+    // Inverse depth, which image motion is proportional to.
     let (near, far) = (1.0 / quantile(0.01), 1.0 / quantile(0.99));
     let span = (near - far).max(1e-9);
     let colour =
@@ -57,8 +57,8 @@ fn map<T: Copy>(plane: &Image<T>, colour: impl Fn(T) -> [f32; 3]) -> RgbImage {
     }
 }
 
-/// Relevancy over a picture of the same size: grey where nothing answers, warm where it does; the
-/// mask gets a white outline.
+/// Relevancy over a picture of the same size: grey where it is low, warm where it is high; the mask
+/// gets a white outline.
 pub fn heat_image(picture: &RgbImage, relevancy: &Image<f32>, mask: Option<&Image<bool>>) -> RgbImage {
     let luma = picture.luma();
     let edge = |x: usize, y: usize| {
@@ -73,8 +73,8 @@ pub fn heat_image(picture: &RgbImage, relevancy: &Image<f32>, mask: Option<&Imag
     let mut data = Vec::with_capacity(relevancy.data.len());
     for y in 0..relevancy.height {
         for x in 0..relevancy.width {
-            // Relevancy 0.5 means "as close as a canonical phrase": below it the picture stays as
-            // it is.
+            // Relevancy 0.5 means "as close as a canonical phrase"; lower values show the plain
+            // picture.
             let heat = ((relevancy.at(x, y) - 0.5) * 2.0).clamp(0.0, 1.0);
             let (base, hot) = (0.25 + 0.5 * luma.at(x, y), turbo(0.45 + 0.5 * heat));
             let share = 0.85 * heat;
@@ -90,8 +90,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn turbo_passes_its_published_colours() {
-        // Entries 0, 128 and 255 of the published table; measured, the polynomial is within 0.02 of
+    fn turbo_matches_published_colours() {
+        // Entries 0, 128 and 255 of the published table. Measured, the polynomial is within 0.02 of
         // it in the middle and up to 0.13 off at the two dark ends.
         for (v, e) in
             [(0.0, [0.19, 0.07, 0.23]), (128.0 / 255.0, [0.645, 0.99, 0.233]), (1.0, [0.48, 0.016, 0.011])]
@@ -103,7 +103,7 @@ mod tests {
     }
 
     #[test]
-    fn neighbouring_labels_differ() {
+    fn colours_of_near_labels_differ() {
         for i in 0..100 {
             for j in 1..8 {
                 let (a, b) = (label(i), label(i + j));
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn unknown_depth_is_black_and_near_is_warm() {
+    fn depth_image_unknown_black_near_warm() {
         let d = Image { width: 3, height: 1, data: vec![0.0, 1.0, 4.0] };
         let c = depth_image(&d);
         assert_eq!(c.data[0], [0.0; 3]);
@@ -122,7 +122,7 @@ mod tests {
     }
 
     #[test]
-    fn heat_marks_the_mask_outline_and_keeps_the_rest_grey() {
+    fn heat_image_outlines_the_mask() {
         let picture = RgbImage { width: 5, height: 5, data: vec![[0.2, 0.4, 0.6]; 25] };
         let mut relevancy = Image::filled(5, 5, 0.3);
         relevancy.data[12] = 0.95;

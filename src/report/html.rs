@@ -1,4 +1,4 @@
-//! `report.html`: one self-contained file, readable on a phone.
+//! `report.html`, one self-contained file, readable on a phone.
 use super::chart::escape;
 use super::{Curve, HtmlReport, QueryShown, ViewShown, chart, colour, duration, one_line, viewer};
 use crate::format::picture;
@@ -40,8 +40,8 @@ fn page(report: &HtmlReport) -> Result<String> {
         let _ = write!(body, "<section class=\"note\"><h2>Warnings</h2><ul>{items}</ul></section>");
     }
     body.push_str("<section class=\"figures\">");
-    // The device stands with the times below and the answers have their own section: cards are for
-    // short figures.
+    // Cards are for short figures: the device is below the times, and answers have their own
+    // section.
     for (label, value) in report.figures.iter().filter(|(l, _)| l != "device" && !l.starts_with('“')) {
         let _ = write!(body, "<div><b>{}</b><span>{}</span></div>", escape(value), escape(label));
     }
@@ -69,7 +69,7 @@ fn page(report: &HtmlReport) -> Result<String> {
     ))
 }
 
-/// A chart with its last value in the caption; empty for a curve without two points.
+/// Chart of a curve with its last value in the caption; empty for a curve without two points.
 fn curve(curve: &Curve) -> String {
     let svg = chart::line_chart(&curve.points, "step", curve.name);
     let (Some((_, last)), false) = (curve.points.last(), svg.is_empty()) else { return String::new() };
@@ -202,7 +202,7 @@ mod tests {
     use crate::scene::Image;
 
     #[test]
-    fn the_page_is_whole_and_needs_nothing_else() {
+    fn html_report_is_self_contained() {
         let photo = RgbImage { width: 8, height: 6, data: vec![[0.5, 0.2, 0.1]; 48] };
         let (depth, relevancy) = (Image::filled(8, 6, 2.0f32), Image::filled(8, 6, 0.9f32));
         let levels = [("l", Image::filled(8, 6, 1i32))];
@@ -256,7 +256,7 @@ mod tests {
         super::super::write_previews(folder.path(), &report).unwrap();
         run.write(folder.path()).unwrap();
         let html = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
-        // Photo, render, depth, one level, one heat map; nothing is fetched; user text is escaped.
+        // Photo, render, depth, one level, one heat map; no requests; user text is escaped.
         assert_eq!(html.matches("data:image/jpeg;base64,").count(), 5);
         assert!(!html.contains("http") && !html.contains("<script>") && html.contains("&lt;script&gt;"));
         for text in [

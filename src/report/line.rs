@@ -1,13 +1,13 @@
-//! Text of files and people as it may stand in a line of a message, a table or a page.
+//! Sanitised text of files and users for a line of a message, a table or a page.
 
 /// Most characters of an error, warning or message. Longer ones keep their beginning and their end,
 /// where the advice is.
 const LONGEST: usize = 1000;
-/// Characters that a longer one keeps of its end.
+/// Characters kept at the end of a longer one.
 const END: usize = 300;
 
-/// One line of bounded length without control characters: messages quote names and texts of files,
-/// which may hold anything.
+/// Text as one line of bounded length without control characters: messages quote names and texts of
+/// files, which may have any content.
 pub fn one_line(message: &str) -> String {
     let mut line = String::with_capacity(message.len().min(4 * LONGEST));
     let mut count = 0;
@@ -20,12 +20,12 @@ pub fn one_line(message: &str) -> String {
     if count <= LONGEST {
         return line;
     }
-    let at = |n: usize| line.char_indices().nth(n).map_or(line.len(), |(at, _)| at);
-    format!("{}…{}", &line[..at(LONGEST - END - 1)], &line[at(count - END)..])
+    let byte = |n: usize| line.char_indices().nth(n).map_or(line.len(), |(byte, _)| byte);
+    format!("{}…{}", &line[..byte(LONGEST - END - 1)], &line[byte(count - END)..])
 }
 
-/// The character, or a sign in its place: terminals obey control characters, and marks of direction
-/// turn text round.
+/// Returns the character, or U+FFFD for control characters, which terminals execute, and
+/// directional marks, which reverse text.
 pub fn visible(c: char) -> char {
     let turns = matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
     if c.is_control() || turns { '\u{fffd}' } else { c }
@@ -36,7 +36,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_is_short_and_has_no_control_characters() {
+    fn one_line_limits_length_and_characters() {
         assert_eq!(one_line("a  b\n c"), "a b c");
         assert_eq!(
             one_line("\u{1b}[31mred\u{7}\u{9b}2J \u{202e}x"),

@@ -50,11 +50,11 @@ pub fn write_previews(folder: &Path, report: &HtmlReport) -> Result<()> {
     Ok(())
 }
 
-/// A text as part of a file name: letters and digits stay, everything else becomes `_`.
+/// Converts a text to a part of a file name: letters and digits stay, other characters become `_`.
 pub fn file_name(text: &str) -> String {
     let mut safe = String::new();
     for c in text.trim().chars().map(|c| if c.is_alphanumeric() { c } else { '_' }).take(60) {
-        // Names of files have at most 255 bytes, and those of views stand in them, too.
+        // File names have at most 255 bytes, and also contain the name of a view.
         if safe.len() + c.len_utf8() > 120 {
             break;
         }

@@ -1,8 +1,8 @@
-//! The closing table of a run on the terminal.
+//! Closing table of a run on the terminal.
 use super::StageRecord;
 use std::fmt::Write;
 
-/// "4.2 s", "3 min 05 s", "1 h 02 min".
+/// Formats a duration: "4.2 s", "3 min 05 s", "1 h 02 min".
 pub fn duration(seconds: f64) -> String {
     let whole = seconds.round() as u64;
     match whole {
@@ -16,7 +16,7 @@ pub fn duration(seconds: f64) -> String {
 /// Width of the time line, characters.
 const LINE: f64 = 30.0;
 
-/// Seconds per stage with a bar on a common time line, then (label, value) figures.
+/// Table of seconds per stage with a bar on a common time line, then (label, value) figures.
 pub fn table(stages: &[StageRecord], total: f64, figures: &[(String, String)]) -> String {
     let mut out = String::new();
     let column = |seconds: f64| (seconds / total.max(1e-9) * LINE).round() as usize;
@@ -44,7 +44,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn times_are_readable() {
+    fn duration_formats_readable_times() {
         let cases = [
             (0.04, "0.0 s"),
             (9.4, "9.4 s"),
@@ -59,7 +59,7 @@ mod tests {
     }
 
     #[test]
-    fn the_table_adds_up() {
+    fn table_bars_show_stage_times() {
         let stage =
             |name: &str, start, seconds| StageRecord { name: name.into(), start, seconds, peak_memory: 0 };
         let stages = [stage("photos", 0.0, 60.0), stage("train", 60.0, 60.0), stage("masks", 30.0, 30.0)];

@@ -13,7 +13,7 @@ fn turned(camera: &Camera, by: DVec3) -> Camera {
     Camera { pose: Pose::exp(DVec3::ZERO, by).compose(&camera.pose), ..camera.clone() }
 }
 
-/// Splats, and two cameras with photos of them.
+/// Splats, two cameras, and their photos of the splats.
 fn scene(device: &Device) -> (Splats, Vec<Camera>, Vec<RgbImage>) {
     let (splats, camera) = seeded::small(300, 75, 53, 0, 1003);
     let cameras = vec![camera.clone(), turned(&camera, DVec3::X * 0.01)];
@@ -23,7 +23,7 @@ fn scene(device: &Device) -> (Splats, Vec<Camera>, Vec<RgbImage>) {
 }
 
 #[test]
-fn training_goes_on_at_the_full_size_with_the_poses_that_it_found_at_half_of_it() {
+fn full_resolution_steps_keep_refined_poses() {
     let device = test_device();
     let (splats, cameras, images) = scene(&device);
     let poses = Some(PoseOptions { start: 0, rate: Exponential::constant(1e-3) });
@@ -32,7 +32,7 @@ fn training_goes_on_at_the_full_size_with_the_poses_that_it_found_at_half_of_it(
     let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
     let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
     let size = |run: &Run| {
-        let frame = run.trainer.parts().raster.frame();
+        let frame = run.trainer.step_resources().raster.frame();
         [frame.width, frame.height, run.trainer.cameras[1].width]
     };
     (0..5).for_each(|iteration| run.step(iteration).unwrap());
@@ -43,27 +43,27 @@ fn training_goes_on_at_the_full_size_with_the_poses_that_it_found_at_half_of_it(
 }
 
 #[test]
-fn refined_cameras_that_explain_the_photos_worse_are_not_kept() {
+fn worse_refined_cameras_are_discarded() {
     let device = test_device();
     let (splats, cameras, images) = scene(&device);
     let options = RgbOptions { coarse: 0.0, bounded: false, ..RgbOptions::preset(Preset::Draft) };
     let scale = SceneScale::measure(&cameras, &splats.means);
     let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
     let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
-    // As if training had led the second camera astray.
+    // A bad refinement of the second camera.
     run.trainer.cameras[1] = turned(&cameras[1], DVec3::Y * 0.2);
     let (_, kept, _, refined) = run.finish().unwrap();
     assert!(!refined && kept == cameras);
 }
 
-/// The right half of a photo is not used.
+/// Coverage of the left half of a photo.
 fn left_half(width: usize, height: usize, outside: Outside) -> Coverage {
     let share = (0..width * height).map(|i| if i % width < width / 2 { 1.0 } else { 0.0 }).collect();
     Coverage { share: Image { width, height, data: share }, outside }
 }
 
 #[test]
-fn unused_pixels_have_no_part_in_training() {
+fn unused_pixels_do_not_train_splats() {
     let device = test_device();
     let (truth, cameras, images) = scene(&device);
     let mut start = truth.clone();
@@ -81,7 +81,7 @@ fn unused_pixels_have_no_part_in_training() {
     let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &coverage };
     let trained =
         fit_photos(&device, photos, start.clone(), scale, &options, &crate::progress::Silent).unwrap();
-    // Splats cover a few pixels: far from the middle they are on one side only.
+    // Splats cover a few pixels, so those far from the middle are on one side only.
     let moved = |columns: std::ops::Range<f64>| {
         let inside = |i: &usize| {
             let (pixel, z) = cameras[0].project(DVec3::from(truth.means[*i].map(f64::from)));
@@ -96,7 +96,7 @@ fn unused_pixels_have_no_part_in_training() {
         2 * left.0 > left.1 && right.0 == 0 && right.1 > 5,
         "moved: {left:?} on the left, {right:?} on the right"
     );
-    // The figure is that of the pixels that count: it is the same whatever is rendered elsewhere.
+    // PSNR is over the used pixels and does not depend on the others.
     let half = |c: usize| RgbImage {
         data: (0..75 * 53).map(|i| if i % 75 < 37 { images[0].data[i] } else { [c as f32; 3] }).collect(),
         ..images[0].clone()
@@ -108,7 +108,7 @@ fn unused_pixels_have_no_part_in_training() {
 fn empty_background_becomes_transparent() {
     let device = test_device();
     let (truth, cameras, images) = scene(&device);
-    // Black splats where nothing is: on a black background no colour tells them from nothing.
+    // Black splats in empty space, which colour cannot distinguish from a black background.
     let mut start = truth.clone();
     let right = |mean: &[f32; 3], camera: &Camera| {
         let (pixel, _) = camera.project(DVec3::from(mean.map(f64::from)));
@@ -129,7 +129,7 @@ fn empty_background_becomes_transparent() {
             fit_photos(&device, photos, start.clone(), scale, &options, &crate::progress::Silent).unwrap();
         let alpha =
             Renderer::new(&device, &trained.splats, &[], 0).unwrap().render(&cameras[0]).unwrap().alpha;
-        // Away from the border, which splats of the left half reach across.
+        // Away from the middle, which splats of the left half reach across.
         let far: Vec<f32> = (0..75 * 53).filter(|i| i % 75 > 48).map(|i| alpha.data[i]).collect();
         far.iter().sum::<f32>() / far.len() as f32
     };

@@ -1,36 +1,36 @@
-//! Where surfaces end in a photo: planes fitted at its borders and at its depth edges.
+//! Ends of surfaces in a photo: planes fitted at its borders and at its depth edges.
 use crate::math::Random;
 use crate::scene::{Camera, DepthMap, RgbImage};
 use glam::{DMat3, DVec2, DVec3};
 
 /// Grid of the splats in units of the longer image side: only the mean colour is known, so finer
-/// splats tell no more.
+/// splats add no detail.
 pub(super) const STEP: f64 = 0.01;
-/// Relative depth by which a splat must stand behind what a photo shows there: above stereo noise.
+/// Least depth of a splat behind a surface, relative to the surface: above stereo noise.
 pub(super) const BEHIND: f64 = 1.05;
 
-/// Half-width of the first window that a plane is fitted in, over the longer side; doubled up to
-/// twice where depth is missing.
+/// Half-width of the first window of a plane fit, over the longer side; doubled up to twice where
+/// depth is missing.
 const WINDOW: f64 = 0.06;
-/// Relative inverse-depth difference that still counts as the same plane: above stereo noise, below
+/// Largest relative inverse-depth difference of an inlier of a plane: above stereo noise, below
 /// object sizes.
 const INLIER: f64 = 0.01;
-/// Samples a plane needs: of a stride-3 grid, a tenth of the window at a straight border.
+/// Fewest samples of a plane: of a stride-3 grid, a tenth of the window at a straight border.
 const SAMPLES: usize = 30;
-/// Difference of colour, root of the summed squares, up to which a pixel looks like the border: a
-/// surface with its texture and shading, not another thing.
+/// Largest colour distance (L2) between a pixel and the border on one surface, including its
+/// texture and shading.
 const ALIKE: f32 = 0.25;
 
-/// A photo with what is known of it.
+/// Photo with camera and depth.
 pub(super) struct Shown<'a> {
     pub(super) image: &'a RgbImage,
     pub(super) camera: &'a Camera,
     pub(super) depth: &'a DepthMap,
-    /// Depth counts from here on.
+    /// Least confidence of depth that is used.
     pub(super) min_confidence: f32,
 }
 
-/// A plane seen at a position where it ends: inverse depth `w + slope·(pixel − at)`.
+/// Plane at a position where it ends: inverse depth `w + slope·(pixel − at)`.
 pub(super) struct Anchor {
     pub(super) at: DVec2,
     pub(super) w: f64,
@@ -38,7 +38,7 @@ pub(super) struct Anchor {
     pub(super) colour: [f32; 3],
 }
 
-/// A pixel of known depth.
+/// Pixel of known depth.
 struct Sample {
     offset: DVec2,
     inverse: f64,
@@ -52,7 +52,7 @@ impl Anchor {
         self.w + self.slope.dot(p - self.at)
     }
 
-    /// The plane with the most weight among samples around `at`, and its mean colour.
+    /// Fits the plane with the most weight to samples around `at`, with its mean colour.
     fn fit(at: DVec2, samples: &[Sample], random: &mut Random) -> Option<Anchor> {
         let (w, slope) = fit_plane(samples, random)?;
         let mut colour = [0.0f64; 3];
@@ -66,21 +66,21 @@ impl Anchor {
         (total > 0.0).then(|| Anchor { at, w, slope, colour: colour.map(|c| (c / total) as f32) })
     }
 
-    /// The one nearest to a position.
+    /// Anchor nearest to a position.
     pub(super) fn nearest<'a>(anchors: impl Iterator<Item = &'a Anchor>, to: DVec2) -> Option<&'a Anchor> {
         let squared = |a: &&Anchor| a.at.distance_squared(to);
         anchors.min_by(|a, b| squared(a).total_cmp(&squared(b)))
     }
 }
 
-/// Planes along the border, one per grid step, where depth allows.
+/// Fits planes along the border, one per grid step, where there is enough depth.
 pub(super) fn at_border(shown: &Shown, random: &mut Random) -> Vec<Anchor> {
     let (DVec2 { x: w, y: h }, step) = (shown.size(), STEP * shown.long());
     let along = |length: f64| (0..=(length / step).ceil() as i64).map(move |i| (i as f64 * step).min(length));
     let horizontal = along(w).flat_map(|x| [DVec2::new(x, 0.0), DVec2::new(x, h)]);
     let vertical = along(h).flat_map(|y| [DVec2::new(0.0, y), DVec2::new(w, y)]);
     let anchor = |at: DVec2| {
-        // Where the border has no depth, the nearest depth may be that of another thing.
+        // Where the border has no depth, the nearest depth may belong to another object.
         let own = shown.mean_colour(at, 2.0 * step);
         let alike = |c: [f32; 3]| (0..3).map(|k| (c[k] - own[k]).powi(2)).sum::<f32>() < ALIKE * ALIKE;
         Anchor::fit(at, &shown.samples(at, |s| alike(s.colour))?, random)
@@ -88,7 +88,7 @@ pub(super) fn at_border(shown: &Shown, random: &mut Random) -> Vec<Anchor> {
     horizontal.chain(vertical).filter_map(anchor).collect()
 }
 
-/// The farther planes at depth edges, at most one per cell of `step` pixels.
+/// Fits the farther planes at depth edges, at most one per cell of `step` pixels.
 pub(super) fn at_edges(shown: &Shown, step: f64, random: &mut Random) -> Vec<Anchor> {
     let anchor = |at: DVec2| {
         // At least 4 × 4 pixels, so that a tenth is one of them.
@@ -121,7 +121,7 @@ impl Shown<'_> {
         self.size().max_element()
     }
 
-    /// Depth of a pixel where it is known well enough.
+    /// Depth of a pixel where its confidence suffices.
     pub(super) fn depth_at(&self, x: usize, y: usize) -> Option<f64> {
         let z = self.depth.depth.at(x, y);
         let known = z > 0.0 && z.is_finite() && self.depth.confidence.at(x, y) >= self.min_confidence;
@@ -149,7 +149,7 @@ impl Shown<'_> {
         sum.map(|s| s / count.max(1) as f32)
     }
 
-    /// The pixels of every `stride`-th row and column within `half` of a position.
+    /// Pixels of every `stride`-th row and column within `half` of a position.
     fn window(&self, at: DVec2, half: f64, stride: usize) -> impl Iterator<Item = (usize, usize)> + use<> {
         let range = |centre: f64, length: usize| {
             ((centre - half).max(0.0) as usize, ((centre + half).max(0.0) as usize).min(length))
@@ -162,7 +162,7 @@ impl Shown<'_> {
     /// `belongs` accepts, weighted towards `at`.
     fn samples(&self, at: DVec2, belongs: impl Fn(&Sample) -> bool) -> Option<Vec<Sample>> {
         let within = |half: f64| -> Vec<Sample> {
-            // At most about 400 samples however large the photo.
+            // At most about 400 samples for any size of photo.
             let stride = (half / 10.0).ceil().max(1.0) as usize;
             let sample = |(x, y): (usize, usize)| {
                 let offset = DVec2::new(x as f64 + 0.5, y as f64 + 0.5) - at;
@@ -177,8 +177,8 @@ impl Shown<'_> {
     }
 }
 
-/// The plane with the most weight: the best of 60 triples (99 % sure to hit a plane with half of
-/// the samples, with a margin for noise), then least squares over its inliers.
+/// Fits the plane with the most weight by RANSAC: the best of 60 triples (99 % sure to find a plane
+/// with half of the samples, with a margin for noise), then least squares over its inliers.
 fn fit_plane(samples: &[Sample], random: &mut Random) -> Option<(f64, DVec2)> {
     let agrees =
         |s: &Sample, p: DVec3| ((p.x + p.y * s.offset.x + p.z * s.offset.y) / s.inverse - 1.0).abs() < INLIER;

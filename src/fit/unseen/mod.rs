@@ -1,10 +1,10 @@
-//! Surfaces continued where no photo shows them.
+//! Surfaces extrapolated beyond the photos.
 //!
-//! Between a few views, a camera soon sees past what any photo shows, beyond its borders and behind
-//! its objects, and finds black there. Planes have an inverse depth that is affine in the pixel
-//! position, so floors, tables and walls continue exactly: coarse flat splats extend the plane that
-//! ends at a photo's border or at a depth edge, in its mean colour. No training view sees them, so
-//! they change no loss.
+//! Between a few views, a camera soon sees regions without splats, beyond the borders of the photos
+//! and behind objects. The inverse depth of a plane is affine in the pixel position, so floors,
+//! tables and walls continue exactly: coarse flat splats extend the plane that ends at a photo
+//! border or at a depth edge, in its mean colour. They are in no training view, so they do not
+//! change the loss.
 mod anchor;
 
 use crate::math::Random;
@@ -14,18 +14,18 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
-/// How far behind a depth edge a plane goes on, in units of the longer image side: at a field of
-/// view of 55°, a camera turned by 20° about what stands in front sees 0.12 of what is half as far
-/// again.
+/// Reach of a plane behind a depth edge, in units of the longer image side. At a field of view of
+/// 55°, a camera that orbits the front object by 20° uncovers 0.12 of a surface at 1.5 times its
+/// depth.
 const REVEALED: f64 = 0.12;
-/// Standard deviation in units of the grid: neighbours at 0.7 blend without gaps.
+/// Standard deviation in units of the grid; at 0.7, neighbours blend without gaps.
 const OVERLAP: f64 = 0.7;
 /// Opacity logit of these splats: about 0.98.
 const LOGIT: f32 = 4.0;
 
-/// One splat to be.
+/// Candidate splat.
 struct UnseenSplat {
-    /// From where the surface ends, pixels.
+    /// Distance from the end of the surface, pixels.
     distance: f64,
     position: DVec3,
     /// World steps of one grid cell along x and y.
@@ -33,8 +33,8 @@ struct UnseenSplat {
     colour: [f32; 3],
 }
 
-/// Flat splats around all photos and behind their depth edges, up to `reach` times the longer side
-/// away from where the surface ends; depth counts from `min_confidence` on.
+/// Creates flat splats around all photos and behind their depth edges, up to `reach` times the
+/// longer side from the end of a surface. Depth below `min_confidence` is ignored.
 pub fn unseen_splats(
     images: &[RgbImage],
     cameras: &[Camera],
@@ -43,7 +43,7 @@ pub fn unseen_splats(
     min_confidence: f32,
     seed: u64,
 ) -> Splats {
-    let of_view = |view: usize| -> Vec<UnseenSplat> {
+    let splats_of_view = |view: usize| -> Vec<UnseenSplat> {
         let shown =
             Shown { image: &images[view], camera: &cameras[view], depth: &depths[view], min_confidence };
         let mut random = Random::new(seed ^ 0x3a61 ^ ((view as u64) << 32));
@@ -52,8 +52,8 @@ pub fn unseen_splats(
         own
     };
     let views = images.len().min(depths.len());
-    let mut all: Vec<UnseenSplat> = (0..views).into_par_iter().flat_map_iter(of_view).collect();
-    // Where several photos continue one surface, the nearest end knows best.
+    let mut all: Vec<UnseenSplat> = (0..views).into_par_iter().flat_map_iter(splats_of_view).collect();
+    // Where several photos continue one surface, the nearest end has priority.
     all.sort_by(|a, b| a.distance.total_cmp(&b.distance));
     let mut taken = HashSet::new();
     let mut splats = Splats::default();
@@ -68,11 +68,11 @@ pub fn unseen_splats(
     splats
 }
 
-/// Splats around one photo and behind what it shows, up to `reach` pixels from where their surfaces
-/// end.
+/// Candidates around one photo and behind its surfaces, up to `reach` pixels from the end of a
+/// surface.
 fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<UnseenSplat> {
     let size = shown.size();
-    // What is hidden is seen through narrow cracks: twice as fine as beyond the borders.
+    // Hidden surfaces appear in narrow gaps, so their grid is twice as fine as beyond the borders.
     let (step, fine) = (STEP * shown.long(), 0.5 * STEP * shown.long());
     let borders = anchor::at_border(shown, random);
     let edges = anchor::at_edges(shown, fine, random);
@@ -85,15 +85,15 @@ fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<UnseenSplat
         let outside = border != pixel && border.distance(pixel) < reach;
         let Some(front) = Anchor::nearest(borders.iter(), border).filter(|_| outside) else { continue };
         out.extend(continued(front, pixel, step));
-        // What continues there may end before the next surface does.
+        // The front surface may end there, so the next one behind it continues, too.
         let next = borders.iter().chain(&edges).filter(|a| a.inverse(pixel) * BEHIND < front.inverse(pixel));
         let next = Anchor::nearest(next, pixel).filter(|a| a.at.distance(pixel) < reach);
         out.extend(next.and_then(|a| continued(a, pixel, step)));
     }
     for pixel in shown.cells(fine, 0.0).filter(|p| p.x < size.x && p.y < size.y) {
         let depth = shown.depth_at(pixel.x as usize, pixel.y as usize);
-        // Nearer to the end of a surface that stands there itself, nothing is revealed: what lies
-        // behind would only shine through what training leaves transparent.
+        // Only behind the visible surface: a continuation on it would shine through splats that
+        // training leaves transparent.
         let next = Anchor::nearest(edges.iter(), pixel)
             .filter(|a| a.at.distance(pixel) < REVEALED * shown.long())
             .filter(|a| depth.is_some_and(|z| a.inverse(pixel) * z * BEHIND < 1.0));
@@ -102,7 +102,8 @@ fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<UnseenSplat
     out
 }
 
-/// True where a candidate would stand before, or on, what another photo shows (or should show).
+/// True where a candidate is in front of or on a surface of another photo, or at a pixel of unknown
+/// depth.
 fn in_the_way(c: &UnseenSplat, camera: &Camera, depth: &DepthMap) -> bool {
     let (pixel, z) = camera.project(c.position);
     let (w, h) = (f64::from(camera.width), f64::from(camera.height));
@@ -113,8 +114,7 @@ fn in_the_way(c: &UnseenSplat, camera: &Camera, depth: &DepthMap) -> bool {
     known <= 0.0 || z < BEHIND * known
 }
 
-/// The splat that continues an anchor's plane at a pixel that does not show it; `None` near or past
-/// the horizon.
+/// Candidate that continues the plane of an anchor at a pixel; `None` near or past the horizon.
 fn candidate(
     camera: &Camera,
     anchor: &Anchor,
@@ -122,8 +122,7 @@ fn candidate(
     distance: f64,
     step: f64,
 ) -> Option<UnseenSplat> {
-    // Beyond three times the distance of its end, or nearer than half of it, a plane is a guess too
-    // far.
+    // Planes beyond three times the depth of their end, or nearer than half of it, are unreliable.
     let value = anchor.inverse(pixel);
     if value < anchor.w / 3.0 || value > anchor.w * 2.0 {
         return None;
@@ -134,7 +133,7 @@ fn candidate(
     Some(UnseenSplat { distance, position, steps, colour: anchor.colour })
 }
 
-/// A flat splat that spans one grid cell of the plane.
+/// Appends a flat splat that spans one grid cell of the plane.
 fn push(splats: &mut Splats, c: &UnseenSplat) {
     let (long, short) = if c.steps[0].length() >= c.steps[1].length() {
         (c.steps[0], c.steps[1])
@@ -174,8 +173,8 @@ mod tests {
         }
     }
 
-    /// Depth of the world plane n·p = offset, with a small nearer object in the middle of the lower
-    /// border.
+    /// Image and depth of the world plane n·p = offset, with a small nearer object in the middle of
+    /// the lower border.
     fn scene(n: DVec3, offset: f64) -> (RgbImage, DepthMap) {
         let camera = camera();
         let centre = camera.pose.centre();
@@ -194,7 +193,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plane_continues_as_itself() {
+    fn unseen_splats_continue_a_plane() {
         let n = DVec3::new(0.1, -0.3, 1.0).normalize();
         let (image, depth) = scene(n, 3.0);
         let known = depth.clone();
@@ -219,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn a_plane_continues_behind_what_stands_before_it() {
+    fn unseen_splats_continue_behind_an_object() {
         let n = DVec3::new(0.1, -0.3, 1.0).normalize();
         let (mut image, mut depth) = scene(n, 3.0);
         let covered = |x: usize, y: usize| (60..100).contains(&x) && (45..75).contains(&y);
@@ -236,12 +235,12 @@ mod tests {
                 continue;
             }
             behind += 1;
-            // On the plane, in its colour; the object's own plane has nothing behind it.
+            // On the plane, in its colour; the plane of the object has no surface in front of it.
             assert!((n.dot(p) - 3.0).abs() < 0.01, "{p} at {z}");
             assert!((sh[0] * SH_C0 + 0.3).abs() < 0.02, "{}", sh[0]);
         }
-        // 40 × 30 px on a grid of 0.8 px, of which one in two to three survives where cells in
-        // space are shared.
+        // 40 × 30 px on a grid of 0.8 px, of which one in two to three remains, since splats share
+        // cells in space.
         assert!(behind > 600, "{behind}");
     }
 
@@ -254,18 +253,18 @@ mod tests {
         splats.means.iter().zip(splats.sh.chunks(3)).map(place).collect()
     }
 
-    /// A photo of walls parallel to its image: depth and colour by pixel; depth 0 is unknown.
-    fn walls(at: impl Fn(usize, usize) -> (f32, [f32; 3])) -> (RgbImage, DepthMap) {
-        let pixels: Vec<_> = (0..160 * 120).map(|i| at(i % 160, i / 160)).collect();
+    /// Photo of walls parallel to the image plane: depth and colour by pixel; depth 0 is unknown.
+    fn walls(wall_at: impl Fn(usize, usize) -> (f32, [f32; 3])) -> (RgbImage, DepthMap) {
+        let pixels: Vec<_> = (0..160 * 120).map(|i| wall_at(i % 160, i / 160)).collect();
         let depth = Image { width: 160, height: 120, data: pixels.iter().map(|p| p.0).collect() };
         let image = RgbImage { width: 160, height: 120, data: pixels.iter().map(|p| p.1).collect() };
         (image, DepthMap { depth, confidence: Image::filled(160, 120, 1.0) })
     }
 
     #[test]
-    fn beyond_a_border_the_next_surface_goes_on_behind_the_first() {
-        // A wall above and a nearer one below row 60: beyond the left border the lower one
-        // continues, and may end.
+    fn next_surface_continues_behind_the_first() {
+        // A wall above and a nearer one below row 60: beyond the left border both continue, since
+        // the nearer one may end.
         let (image, depth) = walls(|_, y| if y < 60 { (3.0, [0.2; 3]) } else { (1.8, [0.8; 3]) });
         let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
         let below: Vec<_> = places(&splats)
@@ -279,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn a_border_without_depth_takes_no_plane_of_another_colour() {
+    fn border_without_depth_ignores_other_colours() {
         // Left: a grey wall without depth in the middle rows, and a red box before it.
         let (image, depth) = walls(|x, y| match (x, (30..90).contains(&y)) {
             (0..20, true) => (0.0, [0.5; 3]),
@@ -295,20 +294,20 @@ mod tests {
     }
 
     #[test]
-    fn nothing_stands_in_front_of_another_photo() {
+    fn unseen_splats_leave_other_photos_free() {
         let n = DVec3::Z;
         let (image, depth) = scene(n, 3.0);
         let mut beside = camera();
-        // Turned by 17°: it sees part of the margin of the first.
+        // Rotated by 17°, with a part of the margin of the first in view.
         beside.pose = Pose::exp(DVec3::ZERO, DVec3::new(0.0, 0.3, 0.0)).compose(&beside.pose);
-        // What it shows is farther away than what continues the first.
+        // Its surfaces are farther away than the continuation of the first.
         let mut farther = depth.clone();
         farther.depth.data.iter_mut().for_each(|z| *z *= 1.5);
         let before = |splats: &Splats, camera: &Camera, depth: &DepthMap| {
             let stands = |p: &&[f32; 3]| {
                 let (pixel, z) = camera.project(DVec3::from(p.map(f64::from)));
                 let inside = (0.0..160.0).contains(&pixel.x) && (0.0..120.0).contains(&pixel.y) && z > 0.0;
-                // Rounding may take a splat behind an edge to the pixel beside it, whose surface it
+                // Rounding may move a splat behind an edge to the next pixel, whose surface it
                 // continues.
                 inside && z < 0.98 * f64::from(depth.depth.at(pixel.x as usize, pixel.y as usize))
             };

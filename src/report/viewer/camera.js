@@ -1,5 +1,5 @@
-// Cameras and the small linear algebra behind them. Conventions are splatvk's: OpenCV axes (+x right, +y down, +z
-// forward), pixel (0, 0) covers [0, 1) x [0, 1), quaternions (w, x, y, z), rotations world -> camera, row-major.
+// Cameras and their linear algebra. Conventions: OpenCV axes (+x right, +y down, +z forward), pixel
+// (0, 0) covers [0, 1) x [0, 1), quaternions (w, x, y, z), rotations world -> camera, row-major.
 
 export const add = (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
 export const sub = (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
@@ -9,9 +9,9 @@ export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * 
 export const unit = (a) => scale(a, 1 / (Math.hypot(...a) || 1));
 const mix = (a, b, t) => a.map((v, i) => v + (b[i] - v) * t);
 
-/// R v of a row-major 3 x 3 matrix.
+/// R v, with a row-major 3 x 3 matrix: world axes to camera axes.
 export const rotate = (r, v) => [0, 3, 6].map((k) => r[k] * v[0] + r[k + 1] * v[1] + r[k + 2] * v[2]);
-/// Transposed R times v: camera axes to world axes.
+/// Rᵀ v: camera axes to world axes.
 export const unrotate = (r, v) => [0, 1, 2].map((k) => r[k] * v[0] + r[k + 3] * v[1] + r[k + 6] * v[2]);
 const multiply = (a, b) => [0, 3, 6].flatMap((i) => [0, 1, 2].map((j) => a[i] * b[j] + a[i + 1] * b[j + 3] + a[i + 2] * b[j + 6]));
 const transpose = (r) => [r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]];
@@ -53,14 +53,14 @@ function slerp(a, b, t) {
   return normalised(a.map((v, i) => p * v + q * to[i]));
 }
 
-/// A camera that may move. `focal` is in units of the image height; `shift` is the principal point's distance from the
-/// image centre in the same unit; `distance` is how far the point is that it turns about.
+/// Movable camera. `focal` and `shift`, the offset of the principal point from the image centre,
+/// are in units of the image height; `distance` is the distance to the pivot.
 export class Camera {
   constructor({ rotation, position, focal, shift = [0, 0], ratio = 4 / 3, aspect = 1, distance = 1 }) {
     Object.assign(this, { rotation, position, focal, shift, ratio, aspect, distance });
   }
 
-  /// The camera of a photo.
+  /// Camera of a photo.
   static of(view, distance) {
     return new Camera({
       rotation: view.rotation,
@@ -81,63 +81,64 @@ export class Camera {
     return scale(rotate(this.rotation, this.position), -1);
   }
 
-  /// The point that it turns about.
+  /// Centre of rotation in world coordinates.
   get pivot() {
     return add(this.position, scale(this.rotation.slice(6), this.distance));
   }
 
-  /// fx, fy, cx, cy for an image of this size, which shows at least all that the photo shows.
+  /// fx, fy, cx, cy for an image of this size, whose field of view includes that of the photo.
   intrinsics(width, height) {
     const unitLength = Math.min(height, width / this.ratio);
     const fy = this.focal * unitLength;
     return [fy * this.aspect, fy, width / 2 + this.shift[0] * unitLength, height / 2 + this.shift[1] * unitLength];
   }
 
-  /// Turns about the pivot: `yaw` about the world's up, `pitch` about its own horizontal axis, radians.
+  /// Rotates about the pivot: `yaw` about the world's up, `pitch` about the horizontal camera axis,
+  /// radians.
   orbit(yaw, pitch, up) {
     const pivot = this.pivot;
     const forward = this.rotation.slice(6), right = this.rotation.slice(0, 3);
-    // Looking straight up or down, left and right would swap: stay 5 degrees off.
+    // Stays 5 degrees off the vertical, where left and right would swap.
     const height = Math.asin(Math.max(-1, Math.min(1, dot(forward, up))));
     const most = Math.PI / 2 - 0.09;
     const tilt = Math.max(-most - height, Math.min(most - height, pitch));
     const turn = multiply(about(up, yaw), about(right, tilt));
-    // By way of a unit quaternion, so that many small turns stay a rotation.
+    // Normalised as a quaternion, so that many small rotations stay a rotation.
     this.rotation = fromQuaternion(normalised(toQuaternion(multiply(this.rotation, transpose(turn)))));
     this.position = sub(pivot, scale(this.rotation.slice(6), this.distance));
   }
 
-  /// Moves along its own axes, world units.
+  /// Moves along the camera axes, world units.
   move(x, y, z) {
     this.position = add(this.position, unrotate(this.rotation, [x, y, z]));
   }
 
-  /// Goes nearer to the pivot (factor below 1) or away.
+  /// Moves towards the pivot (factor below 1) or away from it.
   dolly(factor) {
     const pivot = this.pivot;
     this.distance *= factor;
     this.position = sub(pivot, scale(this.rotation.slice(6), this.distance));
   }
 
-  /// Makes a point the one to turn about, without turning.
+  /// Sets the depth of a point as the distance of the pivot, without rotation.
   aim(point) {
     this.distance = Math.max(dot(sub(point, this.position), this.rotation.slice(6)), 1e-6);
   }
 
-  /// The pixel position and depth of a world point.
+  /// Pixel position and depth of a world point.
   project(point, width, height) {
     const t = rotate(this.rotation, sub(point, this.position));
     const [fx, fy, cx, cy] = this.intrinsics(width, height);
     return [fx * t[0] / t[2] + cx, fy * t[1] / t[2] + cy, t[2]];
   }
 
-  /// The world point of a pixel position at a depth.
+  /// World point of a pixel position at a depth.
   unproject(x, y, depth, width, height) {
     const [fx, fy, cx, cy] = this.intrinsics(width, height);
     return add(this.position, unrotate(this.rotation, [(x - cx) / fx * depth, (y - cy) / fy * depth, depth]));
   }
 
-  /// The way from one camera to the other at t in [0, 1].
+  /// Interpolates between two cameras at t in [0, 1].
   static between(a, b, t) {
     const k = mix([a.focal, a.ratio, a.aspect, a.distance], [b.focal, b.ratio, b.aspect, b.distance], t);
     return new Camera({
@@ -149,7 +150,7 @@ export class Camera {
   }
 }
 
-/// The scene's up: opposite to where the photos' columns point on average.
+/// Up direction of the scene: opposite to the mean direction of the image columns.
 export function upOf(views) {
   const sum = views.reduce((s, v) => sub(s, v.rotation.slice(3, 6)), [0, 0, 0]);
   return Math.hypot(...sum) > 1e-3 ? unit(sum) : [0, -1, 0];

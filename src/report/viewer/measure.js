@@ -1,12 +1,12 @@
-// A tape measure: two places of the scene, the line between them, its length.
+// Tape measure between two points of the scene.
 import { sub } from "splatvk/camera";
 
 const ENDS = ["A", "B"];
 
-/// Four digits are what a click can tell.
+/// Rounds to four digits, the accuracy of a click.
 const short = (value) => Number(value.toPrecision(4));
 
-/// A length with its unit.
+/// Formats a length with its unit.
 export function lengthText(units, metres) {
   if (!metres) return `${short(units)} units`;
   const m = units * metres;
@@ -15,12 +15,12 @@ export function lengthText(units, metres) {
 }
 
 export class Tape {
-  /// `box` holds the drawing (svg), the length (output), the true length (input) and a button to copy; `metres` is the length
-  /// of the scene's unit, if that is known.
+  /// `box` holds the length (output), the true length (input) and a button to copy; `drawing` is
+  /// the svg. `metres` is the length of the scene unit, if it is known.
   constructor(box, drawing, metres, say) {
     Object.assign(this, { box, drawing, metres, points: [], active: false });
     this.input = box.querySelector("input");
-    this.input.oninput = () => this.#state();
+    this.input.oninput = () => this.#updateScale();
     box.querySelector("button").onclick = async () => {
       try {
         await navigator.clipboard.writeText(this.stated());
@@ -38,7 +38,7 @@ export class Tape {
     this.#show();
   }
 
-  /// The next end; after two the first of another length.
+  /// Adds an end point; after two, begins another length.
   place(point) {
     if (this.points.length === 2) this.points = [];
     this.points.push(point);
@@ -46,20 +46,20 @@ export class Tape {
     this.#show();
   }
 
-  /// Scene units; null before both ends are there.
+  /// Length in scene units; null without two end points.
   get units() {
     return this.points.length === 2 ? Math.hypot(...sub(this.points[1], this.points[0])) : null;
   }
 
-  /// What `splatvk measure` reads.
+  /// Option text for `splatvk measure`.
   stated() {
     const place = (p) => p.map((v) => Number(v.toFixed(5))).join(",");
     const is = Number(this.input.value) > 0 ? this.input.value : "METRES";
     return `--scale "${this.points.map(place).join(" - ")} = ${is}"`;
   }
 
-  /// A true length makes the page tell others in metres, too.
-  #state() {
+  /// Sets the scale from a true length, so that other lengths are shown in metres.
+  #updateScale() {
     const metres = Number(this.input.value);
     if (metres > 0 && this.units > 0) this.metres = metres / this.units;
   }
@@ -72,7 +72,7 @@ export class Tape {
     this.box.querySelectorAll("label, button").forEach((e) => { e.hidden = units === null; });
   }
 
-  /// Draws it as a camera sees it; `width` and `height` in CSS pixels.
+  /// Draws the tape from a camera; `width` and `height` in CSS pixels.
   draw(camera, width, height, near) {
     if (!this.active) return;
     const seen = this.points.map((p) => camera.project(p, width, height)).filter((p) => p[2] > near);

@@ -1,9 +1,8 @@
-//! The interactive 3D view: one page section that needs no build step and no request to anywhere
-//! else. `report.html` embeds it with the splats inside; `splatvk view` serves it and answers its
-//! questions.
+//! Interactive 3D view: one page section without a build step and without external requests.
+//! `report.html` embeds it with the splats; `splatvk view` serves it and answers its queries.
 //!
-//! The page is plain modules under an import map of `data:` addresses, so that the same text works
-//! from a file and from a server, with nothing beside it.
+//! The page consists of plain modules under an import map of `data:` URLs, so that the same text
+//! works from a file and from a server.
 mod pack;
 
 pub use pack::{Packed, pack};
@@ -18,16 +17,16 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
 
-/// Where the page asks for the packed splats of [`pack`].
+/// URL path of the packed splats of [`pack`].
 pub const SCENE_PATH: &str = "scene.bin";
 
-/// Splats embedded in a report: about 7 MB of page.
+/// Most splats embedded in a report: about 7 MB of the page.
 const REPORT_SPLATS: usize = 300_000;
 
-/// Height of the photos' thumbnails, pixels: twice what the page shows, for dense screens.
+/// Height of the thumbnails of photos, pixels: twice their size on the page, for dense screens.
 const THUMBNAIL: usize = 104;
 
-/// Name under which the page imports a module, and its text.
+/// Import name and text of each module.
 const MODULES: [(&str, &str); 7] = [
     ("splatvk/camera", include_str!("camera.js")),
     ("splatvk/measure", include_str!("measure.js")),
@@ -40,28 +39,28 @@ const MODULES: [(&str, &str); 7] = [
 
 const MARKUP: &str = include_str!("viewer.html");
 
-/// Style of the section.
+/// Style sheet of the section.
 pub const STYLE: &str = include_str!("viewer.css");
 
-/// One answered query as the page shows it.
+/// Answered query on the page.
 #[derive(Clone, Debug)]
 pub struct ShownAnswer<'a> {
-    /// The text of the query.
+    /// Text of the query.
     pub text: &'a str,
-    /// Views in which it was found.
+    /// Number of views in which it was found.
     pub found: usize,
-    /// Views that were queried.
+    /// Number of queried views.
     pub views: usize,
-    /// Whether the scene shows it, where that can be told.
+    /// Presence in the scene, where it is known.
     pub presence: Option<Presence>,
-    /// What is not understood of the text, for people.
+    /// Remarks on parts of the text that were not understood.
     pub notes: Vec<String>,
-    /// What lights up.
+    /// Highlighted codes.
     pub highlight: &'a Highlight,
 }
 
 impl ShownAnswer<'_> {
-    /// What the page reads.
+    /// JSON that the page reads.
     pub fn json(&self) -> Value {
         let h = self.highlight;
         json!({
@@ -75,31 +74,31 @@ impl ShownAnswer<'_> {
 /// Phrases with their relevancy, best first, per level and code.
 pub type CodeNames = Vec<Vec<Vec<(String, f32)>>>;
 
-/// What the view shows.
+/// Contents of the interactive view.
 #[derive(Clone, Debug)]
 pub struct Scene3d<'a> {
     /// Name of the scene.
     pub title: &'a str,
     /// The Gaussians.
     pub splats: &'a Splats,
-    /// What the photos show of them.
+    /// Visibility of the splats in the photos.
     pub seen: &'a Seen,
-    /// The photos' cameras.
+    /// Cameras of the photos.
     pub cameras: &'a [Camera],
-    /// How the scene lies in the world.
+    /// World frame of the scene.
     pub world: &'a World,
-    /// The photos, for thumbnails; as many as cameras, or none.
+    /// Photos, for thumbnails; as many as cameras, or none.
     pub photos: Vec<&'a RgbImage>,
-    /// Codebooks and features, where the scene has language.
+    /// Language field, where the scene has one.
     pub language: Option<&'a LanguageField>,
-    /// The text model's own phrases for every code; may be empty.
+    /// Phrases of the text model for every code; may be empty.
     pub names: &'a CodeNames,
-    /// Queries that were run.
+    /// Answered queries.
     pub answers: Vec<ShownAnswer<'a>>,
 }
 
 impl Scene3d<'_> {
-    /// The section for a static page, splats included, and what to tell about it.
+    /// Section for a static page with the splats, and a note about it.
     pub fn embedded(&self) -> Result<(String, String)> {
         let packed = pack(self.splats, self.seen, self.language, REPORT_SPLATS)?;
         let data = STANDARD.encode(&packed.bytes);
@@ -115,8 +114,8 @@ impl Scene3d<'_> {
         Ok((section(&manifest, &splats), note))
     }
 
-    /// The whole page of a server that answers `POST query` and sends [`SCENE_PATH`];
-    /// `no_questions` says why it cannot answer.
+    /// Whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `no_questions` is
+    /// the reason why it cannot answer, if any.
     pub fn served(&self, no_questions: Option<&str>) -> Result<String> {
         let mut manifest = self.manifest(no_questions.unwrap_or_default())?;
         manifest["live"] = no_questions.is_none().into();
@@ -173,11 +172,11 @@ fn view(camera: &Camera, photo: Option<&RgbImage>) -> Result<Value> {
     }))
 }
 
-/// Markup, data and modules. In JSON inside a page, `<` could end the script.
+/// Section of markup, data and modules. `<` is escaped, because it could end the script element.
 fn section(manifest: &Value, data: &str) -> String {
-    let address = |text: &str| format!("data:text/javascript;base64,{}", STANDARD.encode(text));
+    let url = |text: &str| format!("data:text/javascript;base64,{}", STANDARD.encode(text));
     let imports: serde_json::Map<String, Value> =
-        MODULES.iter().map(|(name, text)| ((*name).to_owned(), address(text).into())).collect();
+        MODULES.iter().map(|(name, text)| ((*name).to_owned(), url(text).into())).collect();
     let manifest = manifest.to_string().replace('<', "\\u003c");
     format!(
         "{MARKUP}<script type=\"application/json\" id=\"v-manifest\">{manifest}</script>{data}\
@@ -193,7 +192,7 @@ mod tests {
     use crate::scene::seeded;
 
     #[test]
-    fn the_section_is_whole_and_its_data_cannot_break_out() {
+    fn viewer_section_is_complete_and_escaped() {
         let (splats, camera) = seeded::small(40, 64, 48, 1, 3);
         let photo = RgbImage { width: 64, height: 48, data: vec![[0.3; 3]; 64 * 48] };
         let highlight =
@@ -226,7 +225,7 @@ mod tests {
         assert_eq!(manifest["answers"][0]["text"], "</script><b>");
         assert_eq!(manifest["live"], false);
         assert_eq!(manifest["metres"], 0.25, "what the tape multiplies by");
-        // Row 2 of the rotation is where the camera looks.
+        // Row 2 of the rotation is the viewing direction.
         let forward = camera.pose.rotation.row(2);
         assert_eq!(manifest["views"][0]["rotation"][8], forward.z);
         assert_eq!(manifest["views"][0]["rotation"][6], forward.x);
@@ -234,7 +233,7 @@ mod tests {
         assert!(page.contains("viewer full") && page.contains("a&lt;b") && !page.contains("v-splats\""));
         assert!(page.contains("\"ask_note\":\"no model\"") && page.contains("\"live\":false"));
         assert!(scene.served(None).unwrap().contains("\"live\":true"));
-        // Every module that is imported is there.
+        // Every imported module exists.
         for (_, text) in MODULES {
             for line in text.lines().filter(|l| l.starts_with("import ")) {
                 let name = line.split('"').nth(1).unwrap();

@@ -1,16 +1,16 @@
-//! Splats in the few bytes that the page needs: quantised, in spatial order, deflated.
+//! Compact splats for the page: quantised, in spatial order, deflated.
 //!
 //! Little endian, after gzip; N splats, B = ⌈N / 256⌉ blocks, L language levels, R = (degree + 1)²
 //! − 1:
 //!
-//! | what | type | meaning |
+//! | field | type | meaning |
 //! |---|---|---|
-//! | head | `SVKVIEW1`, u32 × 4 | N, SH degree, L, flags: 1 if the last row is there, 2 if the splats are antialiased |
+//! | head | `SVKVIEW1`, u32 × 4 | N, SH degree, L, flags (1: unseen present, 2: antialiased) |
 //! | SH scale | f32 × 3 | largest absolute coefficient of degrees 1, 2, 3 |
 //! | ranges | f32 × 10 per block | lowest and highest x, y, z; log scale; colour |
 //! | x, y, z | u16 × N each | position in the block's range |
 //! | log scales | u8 × N, three times | in the block's range |
-//! | rotation | u32 × N | the three smallest of the unit quaternion as 10 bits each, and which one is the largest |
+//! | rotation | u32 × N | smallest three of the unit quaternion, 10 bits each; index of largest |
 //! | opacity | u8 × N | 0 to 1 |
 //! | red, green, blue | u8 × N each | 0.5 + SH₀ · DC in the block's range |
 //! | SH rest | i8 × N, 3 R times | coefficient by coefficient, RGB; 127 = the scale of its degree |
@@ -25,29 +25,29 @@ use crate::scene::{LanguageField, LevelField, SH_C0, Seen, Splats};
 use crate::{Error, Result};
 use std::io::Write;
 
-/// First bytes of the format.
+/// First bytes of the file.
 const MAGIC: &[u8; 8] = b"SVKVIEW1";
-/// Splats that share a range.
+/// Number of splats that share a range.
 const BLOCK: usize = 256;
-/// A fainter splat is never drawn (docs/internals/method.md#forward-rasterisation).
+/// Least opacity of a drawn splat (docs/internals/method.md#forward-rasterisation).
 const MIN_ALPHA: f32 = 1.0 / 255.0;
 
 /// A packed scene.
 pub struct Packed {
-    /// The gzip stream.
+    /// Gzip stream.
     pub bytes: Vec<u8>,
-    /// Splats in it.
+    /// Number of packed splats.
     pub shown: usize,
-    /// Splats of the scene.
+    /// Number of splats of the scene.
     pub total: usize,
 }
 
-/// Packs at most `most` splats, those that cover the most.
+/// Packs at most `most` splats, those of the largest opacity times area.
 pub fn pack(splats: &Splats, seen: &Seen, language: Option<&LanguageField>, most: usize) -> Result<Packed> {
-    let order = in_space(splats, most_visible(splats, most));
+    let order = morton_order(splats, most_visible(splats, most));
     let levels: Vec<&LevelField> = language.map_or(Vec::new(), |f| f.levels.iter().collect());
     let raw = write(splats, seen, &levels, &order);
-    // 6: a tenth larger than 9 and four times as fast.
+    // Level 6 is a tenth larger than 9 and four times as fast.
     let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::new(6));
     gzip.write_all(&raw)
         .and_then(|()| gzip.try_finish())
@@ -60,31 +60,30 @@ fn alpha(splats: &Splats, i: usize) -> f32 {
     sigmoid(splats.opacity_logits[i])
 }
 
-/// Splats that can be seen; when there are more than `most`, those with the largest opacity times
-/// area.
+/// Indices of visible splats; of more than `most`, those with the largest opacity times area.
 fn most_visible(splats: &Splats, most: usize) -> Vec<usize> {
     let finite = |i: &usize| splats.means[*i].iter().chain(&splats.log_scales[*i]).all(|v| v.is_finite());
-    let seen = |i: &usize| alpha(splats, *i) >= MIN_ALPHA && finite(i);
-    let mut list: Vec<usize> = (0..splats.len()).filter(seen).collect();
+    let visible = |i: &usize| alpha(splats, *i) >= MIN_ALPHA && finite(i);
+    let mut list: Vec<usize> = (0..splats.len()).filter(visible).collect();
     if list.len() > most {
-        let cover = |i: usize| {
+        let log_coverage = |i: usize| {
             let mut s = splats.log_scales[i];
             s.sort_by(f32::total_cmp);
             alpha(splats, i).ln() + s[1] + s[2]
         };
-        list.sort_by(|&a, &b| cover(b).total_cmp(&cover(a)));
+        list.sort_by(|&a, &b| log_coverage(b).total_cmp(&log_coverage(a)));
         list.truncate(most);
     }
     list
 }
 
-/// In Morton order, so that blocks are small.
-fn in_space(splats: &Splats, mut list: Vec<usize>) -> Vec<usize> {
+/// Sorts indices by Morton order, so that blocks are small.
+fn morton_order(splats: &Splats, mut list: Vec<usize>) -> Vec<usize> {
     let (low, high) = bounds(list.iter().map(|&i| splats.means[i]));
     let key = |i: usize| {
         (0..3).fold(0u64, |key, a| {
             let cell = (splats.means[i][a] - low[a]) / (high[a] - low[a]).max(f32::MIN_POSITIVE);
-            // 21 bits an axis fill 63.
+            // 21 bits per axis fill 63.
             key | spread((cell.clamp(0.0, 1.0) * 2_097_151.0) as u64) << a
         })
     };
@@ -92,11 +91,12 @@ fn in_space(splats: &Splats, mut list: Vec<usize>) -> Vec<usize> {
     list
 }
 
-/// Two zero bits before every one of 21 bits.
+/// Inserts two zero bits before each of 21 bits.
 fn spread(v: u64) -> u64 {
     (0..21).fold(0, |out, bit| out | (v >> bit & 1) << (3 * bit))
 }
 
+/// Component-wise minimum and maximum.
 fn bounds<const K: usize>(rows: impl Iterator<Item = [f32; K]>) -> ([f32; K], [f32; K]) {
     rows.fold(([f32::MAX; K], [f32::MIN; K]), |(low, high), row| {
         (std::array::from_fn(|k| low[k].min(row[k])), std::array::from_fn(|k| high[k].max(row[k])))
@@ -142,7 +142,7 @@ fn write(splats: &Splats, seen: &Seen, levels: &[&LevelField], order: &[usize]) 
     for k in 0..3 {
         out.extend(items().map(|(at, i)| byte(share(at, 3, splats.log_scales[i][k]))));
     }
-    items().for_each(|(_, i)| out.extend(rotation(splats.quats[i]).to_le_bytes()));
+    items().for_each(|(_, i)| out.extend(packed_rotation(splats.quats[i]).to_le_bytes()));
     out.extend(items().map(|(_, i)| byte(alpha(splats, i))));
     for k in 0..3 {
         out.extend(items().map(|(at, i)| byte(share(at, 4, colour(i)[k]))));
@@ -186,9 +186,9 @@ fn sh_scales(splats: &Splats, order: &[usize], rest: usize) -> [f32; 3] {
     scales
 }
 
-/// Smallest three: the largest component follows from the unit length; its sign is made positive (q
-/// and −q are one rotation). The others lie within ±√½.
-fn rotation(q: [f32; 4]) -> u32 {
+/// Packs a quaternion by its smallest three components. The largest follows from the unit length,
+/// with a positive sign (q and −q are one rotation); the others are within ±√½.
+fn packed_rotation(q: [f32; 4]) -> u32 {
     let norm = quaternion_norm(&q);
     let largest = (0..4).max_by(|&a, &b| q[a].abs().total_cmp(&q[b].abs())).unwrap_or(0);
     let sign = if q[largest] < 0.0 { -1.0 } else { 1.0 };
@@ -200,10 +200,10 @@ fn rotation(q: [f32; 4]) -> u32 {
     packed
 }
 
-/// Code + 1 of every splat, 0 where its feature is about none.
+/// Code + 1 of every splat, 0 without a code.
 fn codes(level: &LevelField, order: &[usize]) -> Vec<u16> {
-    let of = instances::splat_codes(level);
-    let code = |i: &usize| of.get(*i).copied().flatten().and_then(|k| u16::try_from(k + 1).ok());
+    let splat_codes = instances::splat_codes(level);
+    let code = |i: &usize| splat_codes.get(*i).copied().flatten().and_then(|k| u16::try_from(k + 1).ok());
     order.iter().map(|i| code(i).unwrap_or(0)).collect()
 }
 
@@ -220,7 +220,7 @@ mod tests {
         raw
     }
 
-    /// The page's decoder, value by value.
+    /// Decoder of the page, value by value.
     struct Reader<'a>(&'a [u8]);
 
     impl Reader<'_> {
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn every_quantity_survives_within_its_step() {
+    fn packed_values_are_quantised_correctly() {
         let (splats, _) = seeded::small(700, 40, 30, 2, 5);
         let features: Vec<f32> =
             (0..700).flat_map(|i| [[1.0, 0.0], [0.0, 1.0], [0.0, 0.05]][i % 3]).collect();
@@ -254,7 +254,7 @@ mod tests {
         };
         let level = LevelField { codebook, features, ..LevelField::default() };
         let field = LanguageField { levels: vec![level, LevelField::default()], space: String::new() };
-        let order = in_space(&splats, most_visible(&splats, usize::MAX));
+        let order = morton_order(&splats, most_visible(&splats, usize::MAX));
         let seen = Seen { pixels: (0..700).map(|i| (i % 2) as f32).collect() };
         let packed = pack(&splats, &seen, Some(&field), usize::MAX).unwrap();
         let n = order.len();
@@ -271,7 +271,7 @@ mod tests {
             // Half a step, and the rounding of f32.
             assert!((got - want).abs() <= 0.501 * step + 1e-6 * want.abs(), "{got} {want} {step}");
         };
-        let at = |i: usize, k: usize, share: f32| {
+        let value = |i: usize, k: usize, share: f32| {
             let range = &ranges[i / BLOCK][2 * k..];
             range[0] + share * (range[1] - range[0])
         };
@@ -280,12 +280,12 @@ mod tests {
         };
         for k in 0..3 {
             for (i, &s) in order.iter().enumerate() {
-                near(at(i, k, r.u16() as f32 / 65535.0), splats.means[s][k], step(i, k, 65535.0));
+                near(value(i, k, r.u16() as f32 / 65535.0), splats.means[s][k], step(i, k, 65535.0));
             }
         }
         for k in 0..3 {
             for (i, &s) in order.iter().enumerate() {
-                near(at(i, 3, r.u8() as f32 / 255.0), splats.log_scales[s][k], step(i, 3, 255.0));
+                near(value(i, 3, r.u8() as f32 / 255.0), splats.log_scales[s][k], step(i, 3, 255.0));
             }
         }
         for &s in &order {
@@ -299,7 +299,7 @@ mod tests {
             let want = splats.quats[s];
             let norm = want.iter().map(|v| v * v).sum::<f32>().sqrt();
             let cosine = q.iter().zip(want).map(|(a, b)| a * b).sum::<f32>().abs() / norm;
-            // Three errors of half a step of √2/1023, and what they do to the largest.
+            // Three errors of half a step of √2/1023, and the resulting error of the largest.
             assert!(cosine > 1.0 - 3e-6, "{q:?} {want:?}");
         }
         for &s in &order {
@@ -307,7 +307,11 @@ mod tests {
         }
         for k in 0..3 {
             for (i, &s) in order.iter().enumerate() {
-                near(at(i, 4, r.u8() as f32 / 255.0), 0.5 + SH_C0 * splats.sh[27 * s + k], step(i, 4, 255.0));
+                near(
+                    value(i, 4, r.u8() as f32 / 255.0),
+                    0.5 + SH_C0 * splats.sh[27 * s + k],
+                    step(i, 4, 255.0),
+                );
             }
         }
         for k in 0..8 {
@@ -335,7 +339,7 @@ mod tests {
     }
 
     #[test]
-    fn of_too_many_those_stay_that_cover_most() {
+    fn most_visible_keeps_the_largest_coverage() {
         let (mut splats, _) = seeded::small(50, 40, 30, 0, 1);
         splats.opacity_logits.fill(2.0);
         splats.opacity_logits[7] = -9.0;

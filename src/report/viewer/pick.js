@@ -1,15 +1,16 @@
-// What is under a pixel: the splats that make its colour, blended on the CPU exactly as on the screen, for one pixel.
+// Depth and codes at one pixel, by blending its splats on the CPU exactly as on the screen.
 import { rotate } from "splatvk/camera";
 
 const DILATION = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.99, VOID_ALPHA = 0.5;
 
-/// {depth, codes: [L] code or -1} at a pixel position, or null where less than half the light is used up.
+/// Returns {depth, codes: [L] code or -1} at a pixel position, or null where alpha is below one
+/// half.
 export function pick(splats, camera, x, y, width, height, near) {
   const [fx, fy, cx, cy] = camera.intrinsics(width, height);
   const r = camera.rotation, t = camera.translation;
   const { positions, logScales, quats, opacity, antialiased } = splats;
   const hits = [];
-  // As in projection: the Jacobian is taken at most 15 % of the image beyond its border.
+  // As in the projection, the Jacobian is evaluated at most 15 % of the image beyond its border.
   const limits = [[-(cx + 0.15 * width) / fx, (1.15 * width - cx) / fx], [-(cy + 0.15 * height) / fy, (1.15 * height - cy) / fy]];
   const limit = (slope, [low, high]) => Math.min(Math.max(slope, low), high);
   for (let i = 0; i < splats.count; i++) {
@@ -19,7 +20,8 @@ export function pick(splats, camera, x, y, width, height, near) {
     const u = (r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + t[0]) / z, v = (r[3] * p[0] + r[4] * p[1] + r[5] * p[2] + t[1]) / z;
     const dx = fx * u + cx - x, dy = fy * v + cy - y;
     const lu = limit(u, limits[0]), lv = limit(v, limits[1]);
-    // Beyond 3.4 standard deviations even an opaque splat is below 1/255; slanted ones project up to (1 + u² + v²) larger.
+    // Beyond 3.4 standard deviations even an opaque splat is below 1/255; off-axis splats project
+    // up to (1 + u² + v²) larger.
     const s = Math.exp(Math.max(logScales[3 * i], logScales[3 * i + 1], logScales[3 * i + 2]));
     const reach = 3.4 * Math.sqrt((Math.max(fx, fy) * s / z) ** 2 * (1 + lu * lu + lv * lv) + DILATION);
     if (dx * dx + dy * dy > reach * reach) continue;
@@ -27,23 +29,23 @@ export function pick(splats, camera, x, y, width, height, near) {
     if (alpha >= ALPHA_MIN) hits.push([z, alpha, i]);
   }
   hits.sort((a, b) => a[0] - b[0]);
-  const votes = splats.codes.map(() => new Map());
+  const weights = splats.codes.map(() => new Map());
   let light = 1, depth = 0;
   for (const [z, alpha, i] of hits) {
     const weight = light * alpha;
     depth += weight * z;
-    splats.codes.forEach((codes, l) => votes[l].set(codes[i], (votes[l].get(codes[i]) || 0) + weight));
+    splats.codes.forEach((codes, l) => weights[l].set(codes[i], (weights[l].get(codes[i]) || 0) + weight));
     light -= weight;
     if (light < 1e-4) break;
   }
   if (1 - light < VOID_ALPHA) return null;
-  const best = (votes) => [...votes].reduce((a, b) => (b[1] > a[1] ? b : a), [0, 0])[0] - 1;
-  return { depth: depth / (1 - light), codes: votes.map(best) };
+  const heaviest = (sums) => [...sums].reduce((a, b) => (b[1] > a[1] ? b : a), [0, 0])[0] - 1;
+  return { depth: depth / (1 - light), codes: weights.map(heaviest) };
 }
 
 function alphaAt(i, dx, dy, u, v, z, fx, fy, r, logScales, quats, opacity, antialiased) {
   const [w, a, b, c] = quats.subarray(4 * i, 4 * i + 4);
-  // Columns of the splat's axes in the world, scaled.
+  // Axes of the splat in the world.
   const axes = [
     [1 - 2 * (b * b + c * c), 2 * (a * b + w * c), 2 * (a * c - w * b)],
     [2 * (a * b - w * c), 1 - 2 * (a * a + c * c), 2 * (b * c + w * a)],

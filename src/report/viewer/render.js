@@ -1,5 +1,6 @@
-// Draws splats with WebGL 2. The same projection and blending as splatvk's own renderer (glsl/shared/splat.glsl,
-// glsl/raster_forward.comp), far to near into a half-float image; a second pass turns that image into colours.
+// WebGL 2 renderer of splats. Projection and blending are those of the Vulkan renderer
+// (glsl/shared/splat.glsl, glsl/raster_forward.comp), far to near into a half-float image; a second
+// pass maps that image to colours.
 import { half } from "splatvk/splats";
 
 export const MODES = { colour: 0, depth: 1, level: 2, relevancy: 3, unseen: 4 };
@@ -18,7 +19,7 @@ uniform vec4 intrinsics;     // fx, fy, cx, cy in pixels
 uniform vec2 size;
 uniform float near;
 layout(location = 0) in uint splat;
-flat out vec4 payload;       // what is blended, and the opacity
+flat out vec4 payload;       // blended values, and the opacity
 out vec2 offset;             // in standard deviations
 
 const float DILATION = 0.3, ALPHA_MIN = 1.0 / 255.0;
@@ -119,7 +120,7 @@ void main() {
 const TRIANGLE = `#version 300 es
 void main() { gl_Position = vec4(vec2((gl_VertexID & 1) * 4 - 1, (gl_VertexID & 2) * 2 - 1), 0.0, 1.0); }`;
 
-// The colours of the report: src/report/colour.rs.
+// Colour maps of the report: src/report/colour.rs.
 const RESOLVE = `#version 300 es
 precision highp float;
 uniform sampler2D image;
@@ -184,7 +185,7 @@ export class Renderer {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser offers no WebGL 2");
     this.gl = gl;
-    // Without half floats the image is blended in bytes: banded, but right.
+    // Without half floats the image is blended in bytes, with visible steps.
     this.format = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float")
       ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA8, gl.UNSIGNED_BYTE];
     this.splat = program(gl, VERTEX, FRAGMENT);
@@ -218,7 +219,7 @@ export class Renderer {
     return made;
   }
 
-  /// A texture of `count` texels in rows of a common width.
+  /// Creates a texture of `count` texels in rows of a common width.
   filled(count, make, internal, format, type) {
     const { gl } = this, most = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     const width = Math.min(most, 4096), height = Math.max(1, Math.ceil(count / width));
@@ -267,7 +268,7 @@ export class Renderer {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, this.columns, 6, 0, gl.RGBA, gl.FLOAT, this.table);
   }
 
-  /// Marks codes of a level as selected; nothing with level < 0.
+  /// Marks codes of a level as selected; none with level < 0.
   select(level, codes) {
     this.levels.forEach((l, at) => {
       for (let k = 0; k <= l.colours.length; k++) this.table[4 * (2 * at * this.columns + k) + 3] = at === level && codes.includes(k - 1) ? 1 : 0;
@@ -275,7 +276,7 @@ export class Renderer {
     this.sendTable();
   }
 
-  /// Sets the relevancy per level and code, and which codes of `level` answer.
+  /// Sets the relevancy per level and code, and the codes of `level` that answer.
   answer(relevancy, level, codes) {
     relevancy.forEach((list, at) => list.forEach((v, k) => {
       this.table.set([v, at === level && codes.includes(k) ? 1 : 0], 4 * ((2 * at + 1) * this.columns + k + 1));
@@ -301,7 +302,7 @@ export class Renderer {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.image, 0);
   }
 
-  /// Draws the camera's image at the canvas's size.
+  /// Draws the image of a camera at the size of the canvas.
   draw(camera, { mode, level, selecting, near }) {
     const { gl } = this, [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
     this.resize(width, height);

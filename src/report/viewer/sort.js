@@ -1,6 +1,6 @@
-// Worker: which splats a camera sees, far to near. Gets the positions once, then one request per camera:
-// {row: [r, t] of camera z, rows of x and y, limits} -> indices. Radix sort on the bits of z: exact, and linear in
-// the number of splats.
+// Worker that sorts the splats in view of a camera, far to near. It receives the positions once,
+// then requests {id, rotation, translation, near, slope}, and posts sorted indices with the 1 % and
+// 99 % quantiles of depth. Radix sort on the bits of z: exact, and linear in the number of splats.
 let positions = null, keys, pairs, order, counts;
 
 self.onmessage = ({ data }) => {
@@ -19,10 +19,10 @@ self.onmessage = ({ data }) => {
     const x = positions[p], y = positions[p + 1], w = positions[p + 2];
     z[0] = r[6] * x + r[7] * y + r[8] * w + t[2];
     if (!(z[0] > near)) continue;
-    // Splats whose centre is far outside the image reach into it only where their projection is meaningless.
+    // Splats with a centre far outside reach into the image only where their projection is invalid.
     const u = r[0] * x + r[1] * y + r[2] * w + t[0], v = r[3] * x + r[4] * y + r[5] * w + t[1];
     if (Math.abs(u) > slope[0] * z[0] || Math.abs(v) > slope[1] * z[0]) continue;
-    // Positive floats order like their bits; the complement puts the far ones first.
+    // Positive floats sort like their bits; the complement puts far splats first.
     keys[0][m] = ~bits[0];
     order[0][m++] = i;
   }

@@ -1,4 +1,4 @@
-// Reads the packed scene (src/report/viewer/pack.rs describes it).
+// Reader of the packed scene (format: src/report/viewer/pack.rs).
 const BLOCK = 256;
 
 /// Inflates a gzip stream.
@@ -9,7 +9,7 @@ export async function gunzip(buffer) {
 
 const float = new Float32Array(1), bits = new Uint32Array(float.buffer);
 
-/// The nearest half-precision number, as its 16 bits.
+/// Rounds to the nearest half-precision number; returns its 16 bits.
 export function half(value) {
   float[0] = value;
   const b = bits[0], sign = (b >>> 16) & 0x8000, exponent = (b >>> 23) & 255, mantissa = b & 0x7fffff;
@@ -19,10 +19,10 @@ export function half(value) {
   return sign + ((((exponent - 112) << 10) | (mantissa >>> 13)) + ((mantissa >>> 12) & 1));
 }
 
-/// {count, degree, positions [N, 3], logScales [N, 3], quats [N, 4], packedQuats [N] as in the file, opacity [N],
-/// colours [N, 3], shScale [3],
-/// sh: Int8Array [N, R, 3] or null, codes: [L] x Uint16Array [N], unseen: Uint8Array [N] or null,
-/// antialiased: whether opacities are meant with the 2-D Mip filter}
+/// Unpacks {count, degree, positions [N, 3], logScales [N, 3], quats [N, 4], packedQuats [N] as in
+/// the file, opacity [N], colours [N, 3], shScale [3], sh: Int8Array [N, R, 3] or null, codes: [L]
+/// x Uint16Array [N], unseen: Uint8Array [N] or null, antialiased: whether opacities include the
+/// 2-D Mip filter}.
 export function unpack(buffer) {
   const view = new DataView(buffer), bytes = new Uint8Array(buffer);
   if (new TextDecoder().decode(bytes.subarray(0, 8)) !== "SVKVIEW1") throw new Error("the scene data is damaged");

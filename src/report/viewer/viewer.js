@@ -1,5 +1,5 @@
-// The page: ties the canvas, the controls and the scene together. Everything it needs is in the page itself
-// (#v-manifest), or comes from the server that sent it.
+// Page of the viewer: connects canvas, controls and scene. All data are in the page (#v-manifest),
+// or come from the server that sent it.
 import { Camera, add, scale, upOf } from "splatvk/camera";
 import { Tape } from "splatvk/measure";
 import { pick } from "splatvk/pick";
@@ -19,7 +19,7 @@ let request = 0, sortedFor = -1, waiting = false, drawn = true, flight = null, w
 const idle = [];
 const tape = new Tape(find(".v-tape"), find(".v-line"), manifest.metres, say);
 
-// --- the scene --------------------------------------------------------------------------------------------------
+// --- scene --------------------------------------------------------------------------------------
 
 async function load() {
   const inline = document.getElementById("v-splats");
@@ -51,7 +51,7 @@ async function load() {
   if (root.classList.contains("full")) root.focus();
 }
 
-/// Phones take the graphics context away from pages in the background.
+/// Restores the graphics context, which phones take from pages in the background.
 function restore() {
   renderer = new Renderer(canvas, splats, levels);
   if (state.selected) renderer.select(state.selected.level, state.selected.codes);
@@ -59,7 +59,7 @@ function restore() {
   moved();
 }
 
-/// Every view of a scene without photos: from outside, so that the middle half of the splats fills the picture.
+/// Camera for a scene without photos: outside, so that the central splats fill the picture.
 function overview() {
   const sorted = [0, 1, 2].map((k) => Float32Array.from({ length: splats.count }, (_, i) => splats.positions[3 * i + k]).sort());
   const at = (share) => sorted.map((axis) => axis[Math.floor(share * (axis.length - 1))]);
@@ -77,20 +77,20 @@ function medianDepth(from) {
   return z.sort((a, b) => a - b)[z.length >> 1] || 1;
 }
 
-/// Lets a camera turn about what is in the middle of its picture.
+/// Sets the pivot of a camera to the surface in the middle of its image.
 function aimAt(which) {
   const hit = pick(splats, which, 320, 240, 640, 480, near);
   if (hit) which.distance = hit.depth;
 }
 
-// --- drawing ----------------------------------------------------------------------------------------------------
+// --- drawing ------------------------------------------------------------------------------------
 
 function fit(width, height) {
   if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
 }
 
 function fitToPage() {
-  // Beyond two device pixels per CSS pixel only the battery sees a difference.
+  // More than two device pixels per CSS pixel cost power without a visible difference.
   const ratio = Math.min(devicePixelRatio || 1, 2);
   fit(Math.max(1, Math.round(canvas.clientWidth * ratio)), Math.max(1, Math.round(canvas.clientHeight * ratio)));
 }
@@ -99,12 +99,12 @@ function sort() {
   if (waiting) return;
   waiting = true;
   const [fx, fy, cx, cy] = camera.intrinsics(canvas.width, canvas.height);
-  // Splats reach beyond their centre: half the image more on every side.
+  // Half an image more on every side, since splats reach beyond their centre.
   const slope = [(Math.max(cx, canvas.width - cx) + canvas.width / 2) / fx, (Math.max(cy, canvas.height - cy) + canvas.height / 2) / fy];
   worker.postMessage({ id: request, rotation: camera.rotation, translation: camera.translation, near, slope });
 }
 
-/// The camera or the size of the picture is another.
+/// Redraws after a change of the camera or of the size of the picture.
 function moved() {
   if (!capturing) fitToPage();
   request++;
@@ -142,7 +142,7 @@ const settled = () => new Promise((tell) => idle.push(tell));
 
 let capturing = false;
 
-/// The picture as a PNG blob; with a photo's index, the picture from its camera at its size.
+/// Returns the picture as a PNG blob; with the index of a photo, from its camera at its size.
 async function picture(view) {
   await settled();
   const before = camera;
@@ -163,7 +163,7 @@ async function picture(view) {
   }
 }
 
-// --- cameras ----------------------------------------------------------------------------------------------------
+// --- cameras ------------------------------------------------------------------------------------
 
 const SECONDS_PER_LEG = 1.6;
 const ease = (t) => t * t * (3 - 2 * t);
@@ -180,7 +180,7 @@ function goTo(index, jump = false) {
   current(index);
 }
 
-/// Along all photos, from where it is, and on in circles.
+/// Moves through the cameras of all photos in a loop, from the present camera.
 function play() {
   if (flight) return stop();
   if (!views.length) return;
@@ -228,7 +228,7 @@ function walk(seconds) {
   turn(() => camera.move(x * step, y * step, z * step));
 }
 
-// --- what is shown ----------------------------------------------------------------------------------------------
+// --- display ------------------------------------------------------------------------------------
 
 const modes = [
   { name: "Colour", mode: "colour" },
@@ -258,7 +258,7 @@ function select(level, picked) {
   const code = picked.codes[level];
   state.picked = picked;
   state.selected = { level, codes: [code] };
-  // A selection lights up in colour and on its own level; depth and relevancy would hide it.
+  // A selection is highlighted in colour and on its level; depth and relevancy would hide it.
   if (state.mode !== "level") state.mode = "colour";
   renderer.select(level, [code]);
   show(state.mode, level);
@@ -267,8 +267,8 @@ function select(level, picked) {
   else card(levels[level].one, `${size}. ${manifest.names_note}`, picked, level, names);
 }
 
-/// The phrases that name a code best: the text model's own, and what was asked so far. At 0.5 and below, "object" or
-/// "stuff" says as much.
+/// Phrases that fit a code best, of the text model and of the queries so far. At 0.5 and below, a
+/// phrase fits no better than "object" or "stuff".
 function namesOf(level, code) {
   const all = new Map(levels[level].phrases[code] || []);
   answers.forEach((a) => all.set(a.text, a.relevancy[level][code]));
@@ -304,7 +304,7 @@ function clear() {
   changed();
 }
 
-// --- queries ----------------------------------------------------------------------------------------------------
+// --- queries ------------------------------------------------------------------------------------
 
 const answers = [...manifest.answers];
 
@@ -367,7 +367,7 @@ function say(text) {
   if (text) saying = setTimeout(() => { box.hidden = true; }, 6000);
 }
 
-// --- controls ---------------------------------------------------------------------------------------------------
+// --- controls -----------------------------------------------------------------------------------
 
 function button(text, act, attributes = {}) {
   const made = Object.assign(document.createElement("button"), { type: "button", textContent: text, onclick: act });
@@ -377,14 +377,15 @@ function button(text, act, attributes = {}) {
 
 const sizeOf = (level, code) => splats.codes[level].reduce((n, c) => n + (c === code + 1), 0);
 
-/// The level that a click means: the largest thing that the place belongs to. What takes up a quarter of the scene is
-/// a table or a wall that swallowed its things, so a finer level goes first if there it is smaller.
+/// Level of a click: the coarsest level with a code at this position. A code with a quarter of the
+/// splats is a table or a wall merged with its objects, so a finer level with fewer splats has
+/// priority.
 function levelOf(codes) {
   const thing = codes.findLastIndex((code, level) => code >= 0 && sizeOf(level, code) < splats.count / 4);
   return thing >= 0 ? thing : codes.findLastIndex((code) => code >= 0);
 }
 
-/// Selects what is at a position of the canvas, CSS pixels.
+/// Selects the code at a position of the canvas, CSS pixels.
 function clickAt(x, y, centre = false) {
   const ratio = canvas.width / canvas.clientWidth;
   const hit = pick(splats, camera, x * ratio, y * ratio, canvas.width, canvas.height, near);
@@ -441,7 +442,7 @@ function pointers() {
   });
   const release = (e) => {
     down.delete(e.pointerId);
-    // A press that stayed where it was is a click; a second one there soon after, a double click.
+    // A press without movement is a click; a second one there soon after, a double click.
     if (e.type === "pointerup" && start && e.button === 0) {
       const again = lastTap && e.timeStamp - lastTap[2] < 350 && Math.hypot(start[0] - lastTap[0], start[1] - lastTap[1]) < 12;
       clickAt(start[0], start[1], again);
@@ -453,7 +454,7 @@ function pointers() {
   canvas.addEventListener("pointercancel", release);
   canvas.addEventListener("contextmenu", (e) => e.preventDefault());
   canvas.addEventListener("wheel", (e) => {
-    // In a longer page the wheel scrolls, until the view was clicked.
+    // In a longer page the wheel scrolls until the view has been clicked.
     if (!root.classList.contains("full") && !root.contains(document.activeElement)) return;
     e.preventDefault();
     turn(() => camera.dolly(Math.exp(Math.max(-0.3, Math.min(0.3, e.deltaY * (e.deltaMode ? 0.05 : 0.0015))))));
@@ -533,7 +534,7 @@ function controls() {
   keys();
 }
 
-/// For scripts and tests, as `splatvk` in the console.
+/// Interface for scripts and tests, `splatvk` in the console.
 window.splatvk = {
   ready: load().then(controls),
   state,

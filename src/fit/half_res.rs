@@ -1,8 +1,8 @@
-//! Training first at half the photos' size: there a step costs less than half, and what it fits is
-//! what matters early on.
+//! Photos at half their resolution for the first training steps: a step costs less than half there,
+//! and the coarse structure is fitted first.
 use crate::scene::{Camera, Coverage, DepthMap, Image, RgbImage};
 
-/// What training compares with.
+/// Inputs of training: photos with cameras, depth and coverage.
 #[derive(Clone, Copy)]
 pub(crate) struct Photos<'a> {
     pub(crate) images: &'a [RgbImage],
@@ -10,20 +10,20 @@ pub(crate) struct Photos<'a> {
     pub(crate) cameras: &'a [Camera],
     /// One per photo, if any.
     pub(crate) depths: Option<&'a [DepthMap]>,
-    /// Which pixels of each photo count; empty where all of all do.
+    /// Used pixels of each photo; empty where all pixels are used.
     pub(crate) coverage: &'a [Option<Coverage>],
 }
 
-/// The same at half the size.
-pub(super) struct HalfSizePhotos {
+/// [`Photos`] at half the resolution.
+pub(super) struct HalfResPhotos {
     images: Vec<RgbImage>,
     cameras: Vec<Camera>,
     depths: Option<Vec<DepthMap>>,
     coverage: Vec<Option<Coverage>>,
 }
 
-impl HalfSizePhotos {
-    pub(super) fn of(photos: &Photos) -> HalfSizePhotos {
+impl HalfResPhotos {
+    pub(super) fn of(photos: &Photos) -> HalfResPhotos {
         let Photos { images, cameras, depths, coverage } = *photos;
         let image = |i: &RgbImage| i.resized_by_area(half(i.width), half(i.height));
         let camera = |c: &Camera| c.resized(half(c.width as usize) as u32, half(c.height as usize) as u32);
@@ -32,7 +32,7 @@ impl HalfSizePhotos {
             ..c.clone()
         };
         let depth = |d: &DepthMap| DepthMap { depth: sampled(&d.depth), confidence: sampled(&d.confidence) };
-        HalfSizePhotos {
+        HalfResPhotos {
             images: images.iter().map(image).collect(),
             cameras: cameras.iter().map(camera).collect(),
             depths: depths.map(|all| all.iter().map(depth).collect()),
@@ -50,9 +50,9 @@ fn half(size: usize) -> usize {
     size.div_ceil(2)
 }
 
-/// Every second value: between a near and a far surface there is no depth to average.
+/// Samples every second value: a mean of near and far depths would be on no surface.
 fn sampled(plane: &Image<f32>) -> Image<f32> {
     let (width, height) = (half(plane.width), half(plane.height));
-    let at = |i: usize| plane.at(i % width * plane.width / width, i / width * plane.height / height);
-    Image { width, height, data: (0..width * height).map(at).collect() }
+    let sample = |i: usize| plane.at(i % width * plane.width / width, i / width * plane.height / height);
+    Image { width, height, data: (0..width * height).map(sample).collect() }
 }
