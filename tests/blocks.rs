@@ -1,4 +1,5 @@
-//! What a device cannot bind at once is done in blocks, with the results of the whole.
+//! Processing in blocks where a device cannot bind everything at once, with the results of the
+//! whole.
 #![allow(clippy::unwrap_used)] // helpers of tests
 mod support;
 use glam::DVec3;
@@ -15,7 +16,7 @@ use support::{GpuGradients, Scene, in_bands};
 
 const MIB: u64 = 1 << 20;
 
-/// A device that binds no more than this.
+/// A device with a limited binding size.
 fn limited(bytes: u64, deterministic: bool) -> TestDevice {
     TestDevice::open(&Options { max_binding: Some(bytes), deterministic, ..gpu::options(None) }).unwrap()
 }
@@ -29,30 +30,32 @@ fn difference(a: &[f32], b: &[f32]) -> f32 {
 
 #[track_caller]
 fn assert_alike(a: &GpuGradients, b: &GpuGradients, what: &str) {
-    let flat = |s: &Splats| {
-        [
-            s.means.as_flattened().to_vec(),
-            s.log_scales.as_flattened().to_vec(),
-            s.quats.as_flattened().to_vec(),
-            s.opacity_logits.clone(),
-            s.sh.clone(),
-        ]
-    };
-    let mut pairs: Vec<(Vec<f32>, Vec<f32>)> = flat(&a.splats).into_iter().zip(flat(&b.splats)).collect();
+    let mut pairs: Vec<(Vec<f32>, Vec<f32>)> =
+        parameters(&a.splats).into_iter().zip(parameters(&b.splats)).collect();
     pairs.push((a.features.clone(), b.features.clone()));
     pairs.push((a.camera.clone(), b.camera.clone()));
     for (k, (x, y)) in pairs.iter().enumerate() {
-        // The same numbers added up in another order: about 1e-6 for sums of a thousand values of
+        // The same numbers summed in another order: about 1e-6 for sums of a thousand values of
         // both signs.
         let off = difference(x, y);
         assert!(off < 2e-5, "{what}, class {k}: {off}");
     }
 }
 
+fn parameters(s: &Splats) -> [Vec<f32>; 5] {
+    [
+        s.means.as_flattened().to_vec(),
+        s.log_scales.as_flattened().to_vec(),
+        s.quats.as_flattened().to_vec(),
+        s.opacity_logits.clone(),
+        s.sh.clone(),
+    ]
+}
+
 /// 800 × 600 with 52 channels is 97 MiB of gradients: whole, in two bands and in twelve. The lists
 /// of 16 MiB are too short for all entries at once where gradients are kept per entry.
 #[test]
-fn frames_and_gradients_are_those_of_the_whole() {
+fn bands_equal_whole_frame() {
     let (splats, camera) = seeded::benchmark(4000, 800, 600, 1, 3);
     let scene = Scene::new(splats, &camera, 48, 3);
     let upstream = scene.upstream(5);
@@ -70,10 +73,10 @@ fn frames_and_gradients_are_those_of_the_whole() {
     }
 }
 
-/// Code gradients of all features at once would be 205.7 MiB for so many splats, whatever the
+/// Code gradients of all features at once would be 205.7 MiB for this many splats, whatever the
 /// image.
 #[test]
-fn gradients_by_entry_fit_for_many_splats() {
+fn entry_gradients_fit_many_splats() {
     let (splats, camera) = seeded::benchmark(130_000, 320, 240, 0, 4);
     let scene = Scene::new(splats, &camera, 48, 4);
     let upstream = scene.upstream(6);
@@ -84,7 +87,7 @@ fn gradients_by_entry_fit_for_many_splats() {
 }
 
 #[test]
-fn an_image_too_large_for_the_device_is_rendered_in_bands() {
+fn large_image_renders_in_bands() {
     // 700,000 pixels: two bands at 128 MiB.
     let (splats, camera) = seeded::benchmark(2000, 1000, 700, 0, 3);
     let features = seeded::features(2000, 48, 1);
@@ -95,28 +98,29 @@ fn an_image_too_large_for_the_device_is_rendered_in_bands() {
     assert!(frame(128) == frame(24));
 }
 
-/// Landscape, portrait and panorama, and what the splats look like in them.
+/// Landscape, portrait and panorama cameras, and the splats rendered by them.
 fn photos(device: &Device, splats: &Splats, sizes: &[(u32, u32)]) -> (Vec<Camera>, Vec<RgbImage>) {
     let mut renderer = Renderer::new(device, splats, &[], 0).unwrap();
-    let camera = |(i, &(width, height)): (usize, &(u32, u32))| {
-        let a = i as f64 - 0.5;
-        let pose = Pose::exp(DVec3::new(-0.3 * a, 0.1 * a, 0.0), DVec3::new(0.01 * a, 0.05 * a, 0.0));
-        seeded::camera(width, height, pose)
-    };
     let cameras: Vec<Camera> = sizes.iter().enumerate().map(camera).collect();
     let images = cameras.iter().map(|c| renderer.render(c).unwrap().rgb).collect();
     (cameras, images)
 }
 
+fn camera((i, &(width, height)): (usize, &(u32, u32))) -> Camera {
+    let a = i as f64 - 0.5;
+    let pose = Pose::exp(DVec3::new(-0.3 * a, 0.1 * a, 0.0), DVec3::new(0.01 * a, 0.05 * a, 0.0));
+    seeded::camera(width, height, pose)
+}
+
 #[test]
-fn colours_are_trained_in_bands_as_in_whole_images() {
+fn colour_training_in_bands_matches_whole() {
     let (truth, _) = seeded::benchmark(1500, 320, 240, 0, 9);
     let (cameras, images) = photos(&test_device(), &truth, &[(320, 240), (240, 320), (600, 90), (317, 235)]);
     let mut start = truth.clone();
     start.sh.iter_mut().for_each(|v| *v *= 0.7);
     let options = RgbOptions {
         iterations: 8,
-        coarse: 0.0,
+        half_res: 0.0,
         report_every: 1,
         poses: None,
         ..RgbOptions::preset(Preset::Draft)
@@ -131,13 +135,14 @@ fn colours_are_trained_in_bands_as_in_whole_images() {
     for (a, b) in whole.stats.curve.iter().zip(&bands.stats.curve) {
         assert!((a.loss - b.loss).abs() < 1e-5 && (a.ssim - b.ssim).abs() < 1e-5, "{a:?} {b:?}");
     }
-    // Adam's first steps are as long for tiny gradients as for large ones: single splats may part.
+    // Adam's first steps are as long for tiny gradients as for large ones: single splats may
+    // diverge.
     let close = whole.splats.sh.iter().zip(&bands.splats.sh).filter(|(a, b)| (*a - *b).abs() < 1e-3).count();
     assert!(close * 100 > 99 * whole.splats.sh.len(), "{close} of {}", whole.splats.sh.len());
     assert!(whole.stats.psnr.iter().zip(&bands.stats.psnr).all(|(a, b)| (a - b).abs() < 0.01));
 }
 
-/// Three levels of eight codes of 16 numbers, labels in squares, none in every fifth.
+/// Three levels of eight codes of 16 numbers; labels in squares, none in every fifth.
 fn field(images: &[RgbImage]) -> LanguageField {
     let level = |l: u64| {
         let mut codes = seeded::features(8, 16, 40 + l);
@@ -170,7 +175,7 @@ fn field(images: &[RgbImage]) -> LanguageField {
 }
 
 #[test]
-fn language_is_trained_decoded_and_asked_in_bands_as_in_whole_images() {
+fn language_in_bands_matches_whole() {
     let (splats, _) = seeded::benchmark(3000, 640, 480, 0, 9);
     let whole = limited(128 * MIB, true);
     let (cameras, images) = photos(&whole, &splats, &[(640, 480), (480, 640)]);
@@ -205,7 +210,7 @@ fn language_is_trained_decoded_and_asked_in_bands_as_in_whole_images() {
             assert!(close * 100 > 99 * a.features.len(), "{mib} MiB: {close} of {}", a.features.len());
         }
         for camera in &cameras {
-            // The same scene on both devices: the same bits.
+            // The same scene on both devices gives the same bits.
             assert!(
                 seen(&whole, &reference.field, camera) == seen(&device, &reference.field, camera),
                 "{mib} MiB"

@@ -1,4 +1,4 @@
-//! Training on scenes whose geometry is known exactly.
+//! Training on scenes with exactly known geometry.
 #![allow(clippy::unwrap_used)] // helpers of tests
 use glam::{DMat3, DVec2, DVec3};
 use splatvk::fit::{self, Preset, RgbOptions};
@@ -46,15 +46,15 @@ fn view(folder: &Path, frame: &serde_json::Value, shrink: usize) -> View {
     let path = folder.join(format!("depth/{}.npz", photo.stem));
     let depth = npy::read_npz(path).unwrap()["depth"].to_f32();
     let (w, h) = (width / shrink, height / shrink);
-    let at = |i: usize| ((i % w) * shrink, (i / w) * shrink);
+    let corner = |i: usize| ((i % w) * shrink, (i / w) * shrink);
     let mean = |i: usize| {
-        let (x, y) = at(i);
+        let (x, y) = corner(i);
         let block = |c: usize| {
             (0..shrink * shrink).map(|b| photo.image.at(x + b % shrink, y + b / shrink)[c]).sum::<f32>()
         };
         [0, 1, 2].map(|c| block(c) / (shrink * shrink) as f32)
     };
-    let centre = |i: usize| depth[(at(i).1 + shrink / 2) * width + at(i).0 + shrink / 2];
+    let centre = |i: usize| depth[(corner(i).1 + shrink / 2) * width + corner(i).0 + shrink / 2];
     View {
         image: RgbImage { width: w, height: h, data: (0..w * h).map(mean).collect() },
         camera: camera.resized(w as u32, h as u32),
@@ -62,7 +62,7 @@ fn view(folder: &Path, frame: &serde_json::Value, shrink: usize) -> View {
     }
 }
 
-/// The surface as the views see it: every pixel, unless an earlier view has that surface already.
+/// Surface points of the views: every pixel, unless an earlier view has that surface already.
 fn points(views: &[View]) -> PointCloud {
     let mut cloud = PointCloud::default();
     for (v, view) in views.iter().enumerate() {
@@ -109,16 +109,16 @@ impl Progress for Print {
     }
 }
 
-/// `NAME` from the environment as a number: the tuning knobs of the ignored measurement below.
+/// Environment variable `NAME` as a number: tuning parameters of the ignored measurement below.
 fn knob(name: &str, default: f64) -> f64 {
     std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(default)
 }
 
-/// Measures train and held-out PSNR with exact cameras and points: what training alone reaches.
+/// Measures train and held-out PSNR with exact cameras and points: the limit of training alone.
 /// `cargo test --test fit -- --ignored --nocapture breakfast`
 #[test]
 #[ignore = "a measurement of about two minutes on a CPU device"]
-fn breakfast_with_exact_geometry() {
+fn fit_breakfast_with_exact_geometry() {
     let shrink = knob("SHRINK", 1.0) as usize;
     let (train, test) = (load("train", shrink), load("test", shrink));
     let device = gpu::open(None).unwrap();
@@ -134,8 +134,8 @@ fn breakfast_with_exact_geometry() {
     let cloud = points(&train);
     let mut options = RgbOptions::preset(Preset::Draft);
     options.iterations = knob("ITERATIONS", options.iterations as f64) as usize;
-    options.depth_weight = knob("DEPTH", options.depth_weight);
-    options.ratio_weight = knob("RATIO", options.ratio_weight);
+    options.losses.depth = options.losses.depth.map(|weight| knob("DEPTH", weight));
+    options.losses.needles = options.losses.needles.map(|weight| knob("RATIO", weight));
     options.margin = knob("MARGIN", options.margin);
     options.init.opacity = knob("OPACITY", options.init.opacity.into()) as f32;
     options.init.footprint = knob("FOOTPRINT", options.init.footprint.into()) as f32;
@@ -189,10 +189,10 @@ fn breakfast_with_exact_geometry() {
     );
 }
 
-/// Six times the light of the 8-bit photos: what shows nearly white there is far above 1 here. It
-/// must come back from the trained scene, through a file as well.
+/// Six times the light of the 8-bit photos: nearly white areas are far above 1 here. The trained
+/// scene must reproduce it, also from a file.
 #[test]
-fn light_above_one_is_learnt_and_rendered() {
+fn fit_learns_light_above_one() {
     let mut train = load("train", 8);
     for view in &mut train {
         view.image.data.iter_mut().flatten().for_each(|v| *v = to_srgb(6.0 * to_linear(*v)));

@@ -1,4 +1,4 @@
-//! Training on small scenes that are made of splats themselves, so that the truth is known exactly.
+//! Training on small scenes made of splats, with exactly known truth.
 #![allow(clippy::unwrap_used)] // helpers of tests
 use glam::DVec3;
 use splatvk::fit::schedule::Exponential;
@@ -34,23 +34,25 @@ fn wall(n: usize, seed: u64) -> Splats {
 }
 
 fn cameras(n: usize) -> Vec<Camera> {
-    let camera = |i: usize| {
-        let a = i as f64 - (n - 1) as f64 * 0.5;
-        // Each turns towards the wall's centre as it moves sideways.
-        let pose = Pose::exp(DVec3::ZERO, DVec3::new(0.03 * a, 0.17 * a, 0.02 * a))
-            .compose(&Pose { translation: DVec3::new(-0.7 * a, 0.1 * a, 0.05 * a * a), ..Pose::IDENTITY });
-        Camera {
-            name: format!("view {i}"),
-            width: WIDTH,
-            height: HEIGHT,
-            fx: 90.0,
-            fy: 90.0,
-            cx: 48.0,
-            cy: 36.0,
-            pose,
-        }
-    };
-    (0..n).map(camera).collect()
+    (0..n).map(|i| camera(i, n)).collect()
+}
+
+/// Camera `i` of `n`; each turns towards the centre of the wall as it moves sideways.
+fn camera(i: usize, n: usize) -> Camera {
+    let a = i as f64 - (n - 1) as f64 * 0.5;
+    // Each turns towards the wall's centre as it moves sideways.
+    let pose = Pose::exp(DVec3::ZERO, DVec3::new(0.03 * a, 0.17 * a, 0.02 * a))
+        .compose(&Pose { translation: DVec3::new(-0.7 * a, 0.1 * a, 0.05 * a * a), ..Pose::IDENTITY });
+    Camera {
+        name: format!("view {i}"),
+        width: WIDTH,
+        height: HEIGHT,
+        fx: 90.0,
+        fy: 90.0,
+        cx: 48.0,
+        cy: 36.0,
+        pose,
+    }
 }
 
 fn photos(device: &Device, splats: &Splats, cameras: &[Camera]) -> Vec<RgbImage> {
@@ -65,7 +67,7 @@ fn angle(a: &Pose, b: &Pose) -> f64 {
 }
 
 #[test]
-fn a_perturbed_camera_is_recovered() {
+fn fit_recovers_perturbed_camera() {
     let device = test_device();
     let splats = wall(700, 5);
     let truth = cameras(3);
@@ -78,11 +80,11 @@ fn a_perturbed_camera_is_recovered() {
     assert!(angle(&start[2].pose, &truth[2].pose) > 0.49);
 
     let mut options = RgbOptions::preset(Preset::Draft);
-    // 300 updates of the camera: turning and shifting look alike, so the last tenths of a degree
-    // come slowly.
+    // 300 updates of the camera: rotation and translation have similar effects, so the last tenths
+    // of a degree converge slowly.
     options.iterations = 900;
-    // These splats stand still; at half the size they would need to look different.
-    options.coarse = 0.0;
+    // The splats are fixed; at half resolution they would need another appearance.
+    options.half_res = 0.0;
     options.rates = fit::Rates::STILL;
     let rate = Exponential { start: 1e-3, end: 3e-5, steps: 900 };
     options.poses = Some(fit::pose::PoseOptions { start: 0, rate });
@@ -99,7 +101,7 @@ fn a_perturbed_camera_is_recovered() {
 }
 
 #[test]
-fn colours_and_shapes_are_fitted_and_a_seed_repeats() {
+fn fit_recovers_scene_and_repeats_seed() {
     let device = TestDevice::open(&Options { deterministic: true, ..gpu::options(None) }).unwrap();
     let truth = wall(500, 8);
     let cameras = cameras(3);
@@ -123,7 +125,7 @@ fn colours_and_shapes_are_fitted_and_a_seed_repeats() {
 }
 
 #[test]
-fn faint_splats_are_pruned_and_broken_input_is_refused() {
+fn fit_prunes_faint_splats() {
     let device = test_device();
     let truth = wall(300, 8);
     let cameras = cameras(2);
@@ -141,7 +143,7 @@ fn faint_splats_are_pruned_and_broken_input_is_refused() {
     assert!(wrong.unwrap_err().to_string().contains("one camera per photo"));
 }
 
-/// Splats of SH degree 0 that are asked what they lack, with cameras that see `truth`.
+/// Result of view-dependent fitting for splats of SH degree 0, with photos of `truth`.
 fn with_view_dependence(device: &Device, truth: &Splats, cameras: &[Camera], degree: Option<u32>) -> Trained {
     let images = photos(device, truth, cameras);
     let mut start = Splats { sh_degree: 0, ..truth.clone() };
@@ -150,7 +152,7 @@ fn with_view_dependence(device: &Device, truth: &Splats, cameras: &[Camera], deg
         iterations: 1,
         rates: fit::Rates::STILL,
         poses: None,
-        coarse: 0.0,
+        half_res: 0.0,
         ..RgbOptions::preset(Preset::Draft)
     };
     let scale = fit::scale::SceneScale::measure(cameras, &start.means);
@@ -165,12 +167,12 @@ fn with_view_dependence(device: &Device, truth: &Splats, cameras: &[Camera], deg
 }
 
 #[test]
-fn colours_depend_on_the_direction_where_photos_left_out_gain_by_it() {
+fn view_dependence_needs_heldout_gain() {
     let device = test_device();
     let cameras = cameras(9);
     let (held_out, seen) = cameras.split_at(1);
     let matte = wall(500, 8);
-    // Brighter from the right: one slope for all, as a lamp far away makes it.
+    // Brighter from the right: one slope for all, as from a distant lamp.
     let mut glossy = Splats { sh_degree: 1, ..matte.clone() };
     glossy.sh = matte.sh.chunks_exact(3).flat_map(|c| [c, &[0.0; 6], &[-0.5; 3]].concat()).collect();
 
@@ -233,7 +235,7 @@ fn language_options() -> LanguageOptions {
 }
 
 #[test]
-fn two_objects_are_told_apart_in_every_parameterisation() {
+fn language_separates_objects_in_all_modes() {
     let device = test_device();
     let splats = wall(700, 5);
     let cameras = cameras(3);
@@ -265,7 +267,7 @@ fn two_objects_are_told_apart_in_every_parameterisation() {
     }
 }
 
-/// Share of the labelled pixels of a level that a saved and loaded scene decodes to their label.
+/// Share of a level's labelled pixels that a saved and loaded scene decodes to their label.
 fn decoded_right(device: &Device, scene: &scene_dir::Scene, truth: &LevelField, level: usize) -> f64 {
     let mut viewer = Viewer::new(device, &scene.splats, scene.language.as_ref().unwrap()).unwrap();
     let (mut right, mut labelled) = (0, 0);
@@ -280,15 +282,14 @@ fn decoded_right(device: &Device, scene: &scene_dir::Scene, truth: &LevelField, 
 }
 
 #[test]
-fn a_scene_with_a_model_per_level_decodes_as_it_was_trained() {
+fn model_per_level_decodes_as_trained() {
     let device = test_device();
     let splats = wall(700, 5);
     let cameras = cameras(3);
     let images = photos(&device, &splats, &cameras);
     let field = two_objects(&device, &splats, &cameras);
     let seen = Seen::default();
-    // Fast enough that the levels' splats are clearly others in the end, and on their way in
-    // another order.
+    // A rate at which the splats of the levels clearly diverge, also in their depth order.
     let rate = Exponential { start: 0.03, end: 0.03, steps: 40 };
     let rates = fit::Rates { means: rate, ..language_options().rates };
     let options = LanguageOptions { per_level: true, rates, image_weight: 0.0, ..language_options() };
@@ -317,7 +318,7 @@ fn a_scene_with_a_model_per_level_decodes_as_it_was_trained() {
         // The device also leaves pixels of faint splats without a code.
         assert!((measured - decoded).abs() < 2e-3, "level {level}: {measured} trained, {decoded} loaded");
     }
-    // Features are on the channels of their levels, whichever model they are rendered with.
+    // Features are on the channels of their levels, with any of the models.
     let mut viewer = Viewer::new(&device, &loaded.splats, loaded.language.as_ref().unwrap()).unwrap();
     let frame = viewer.view_with_features(&cameras[0]).unwrap();
     for (level, first) in [(0, 0), (2, 3)] {
@@ -327,8 +328,7 @@ fn a_scene_with_a_model_per_level_decodes_as_it_was_trained() {
             .filter(|(f, code)| **code < 0 || codes.decode(&f[first..first + 3]) == Some(**code as usize));
         assert_eq!(alike.count(), frame.rendered.alpha.data.len(), "level {level}");
     }
-    // Mirrored splats of one level show its objects the other way round; the other level and the
-    // colours stay.
+    // Mirrored splats of one level exchange its objects; the other level and the colours stay.
     let mut mirrored = trained.field.clone();
     mirrored.levels[0].splats.as_mut().unwrap().means.iter_mut().for_each(|p| p[0] = -p[0]);
     let folder = tempfile::tempdir().unwrap();
@@ -339,7 +339,7 @@ fn a_scene_with_a_model_per_level_decodes_as_it_was_trained() {
 }
 
 #[test]
-fn only_the_ratio_of_rate_and_epsilon_matters_from_zero() {
+fn ratio_of_rate_and_epsilon_matters() {
     let device = test_device();
     let splats = wall(400, 6);
     let cameras = cameras(2);
@@ -360,13 +360,13 @@ fn only_the_ratio_of_rate_and_epsilon_matters_from_zero() {
     let decode = |f: &[f32]| f[0] > f[1];
     let pairs = a.field.levels[0].features.chunks_exact(3).zip(b.field.levels[0].features.chunks_exact(3));
     let differing = pairs.filter(|(x, y)| decode(x) != decode(y)).count();
-    // Splats that no labelled pixel saw stay at rounding noise; of the others only near ties may
+    // Splats without labelled pixels stay at rounding noise; of the others only near ties may
     // differ.
     assert!(differing <= splats.len() / 100, "{differing} of {} decode differently", splats.len());
 }
 
 #[test]
-fn without_weight_the_language_loss_changes_nothing() {
+fn zero_language_weight_changes_nothing() {
     let device = test_device();
     let splats = wall(300, 6);
     let cameras = cameras(2);

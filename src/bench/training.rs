@@ -25,7 +25,7 @@ pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)
     let target = [workload.target(device)?];
     let cameras = [workload.camera.clone()];
     let options =
-        RgbOptions { rates: Rates::STILL, poses: None, coarse: 0.0, ..RgbOptions::preset(Preset::Default) };
+        RgbOptions { rates: Rates::STILL, poses: None, half_res: 0.0, ..RgbOptions::preset(Preset::Default) };
     let scale = SceneScale::measure(&cameras, &workload.splats.means);
     let photos = Photos { images: &target, cameras: &cameras, depths: None, coverage: &[] };
     let mut run = RgbRun::new(device, photos, &workload.splats, scale, &options)?;

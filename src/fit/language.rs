@@ -2,7 +2,6 @@
 //! (docs/internals/method.md#language-training), `L = λ2·L_img + (1−λ2)·L_sem`, from lifted
 //! features.
 use super::half_res::Photos;
-use super::least_squares;
 use super::lift::{CodeTargets, Lifting};
 use super::model::{Model, not_finite};
 use super::options::{LanguageOptions, Start};
@@ -187,7 +186,6 @@ impl<'a> Run<'a> {
         match options.start {
             Start::Zero => {}
             Start::Lifted => model.values.features.write(&lifted.features(width))?,
-            Start::LeastSquares => least_squares::solve(&mut lifting, &lifted)?,
         }
         let losses = views
             .stages

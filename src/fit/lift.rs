@@ -67,11 +67,6 @@ impl CodeTargets {
         })
     }
 
-    /// d, the length of a code.
-    pub(super) fn width(&self) -> usize {
-        self.width as usize
-    }
-
     /// Targets of the language loss in one band of a view.
     pub(super) fn of(&self, view: usize, band: &Band) -> Targets<'_> {
         Targets {

@@ -1,4 +1,5 @@
 //! Options of the training stages, and their presets.
+use super::losses::Losses;
 use super::pose::PoseOptions;
 use super::schedule::Exponential;
 use crate::preset::Preset;
@@ -61,18 +62,11 @@ pub struct RgbOptions {
     /// Learning rates.
     pub rates: Rates,
     /// Share of the steps, from the first on, with the photos at half their resolution.
-    pub coarse: f64,
-    /// Weight of mean |render − photo|.
-    pub l1_weight: f64,
-    /// Weight of 1 − SSIM.
-    pub dssim_weight: f64,
-    /// Weight of the relative depth difference to the stereo depth where that is confident; 0 =
-    /// off.
-    pub depth_weight: f64,
+    pub half_res: f64,
+    /// Terms of the objective.
+    pub losses: Losses,
     /// Least confidence of stereo depth that is used.
     pub min_confidence: f32,
-    /// Weight of `mean max(0, s_max/s_min − 8)`, against needles; 0 = off.
-    pub ratio_weight: f64,
     /// Whether splats are kept behind the nearest depths of the photos and below a share of their
     /// distance to the cameras in size; applied at the start, when pruning, and at the end.
     pub bounded: bool,
@@ -128,7 +122,7 @@ impl RgbOptions {
         // There are a few more of the other steps, because new splats are untrained. With many
         // photos, each is used as often as in a run with sixteen.
         let steps = self.iterations.div_ceil(2).max(self.iterations * (known + new) / 16);
-        let mut options = RgbOptions { coarse: 0.0, ..self.with_iterations(steps) };
+        let mut options = RgbOptions { half_res: 0.0, ..self.with_iterations(steps) };
         options.init.max_points = (options.init.max_points * new).div_ceil((known + new).max(1));
         options
     }
@@ -137,7 +131,7 @@ impl RgbOptions {
     /// a few photos: 0.9 dB more on them, 0.3 less on views between them
     /// (docs/internals/experiments.md#how-long-to-train).
     fn short() -> Self {
-        RgbOptions { coarse: 0.6, ..Self::scaled(300, 2.0) }
+        RgbOptions { half_res: 0.6, ..Self::scaled(300, 2.0) }
     }
 
     /// Options of the draft preset, with fewer splats: on breakfast two fifths less time and 0.4 dB
@@ -166,9 +160,8 @@ impl RgbOptions {
                 sh_dc: 2.5e-3 * speed,
                 sh_rest: 2.5e-3 / 20.0 * speed,
             },
-            depth_weight: 0.02,
+            losses: Losses { depth: Some(0.02), needles: Some(1e-3), ..Losses::PHOTOS },
             min_confidence: 0.5,
-            ratio_weight: 1e-3,
             bounded: true,
             poses: Some(PoseOptions {
                 start: (iterations / 10).min(100),
@@ -197,12 +190,9 @@ impl RgbOptions {
                 sh_dc: 2.5e-3,
                 sh_rest: 2.5e-3 / 20.0,
             },
-            coarse: 0.0,
-            l1_weight: 0.8,
-            dssim_weight: 0.2,
-            depth_weight: 0.0,
+            half_res: 0.0,
+            losses: Losses::PHOTOS,
             min_confidence: 0.5,
-            ratio_weight: 0.0,
             bounded: false,
             prune_opacity: 0.005,
             prune_every: 100,
@@ -221,8 +211,6 @@ pub enum Start {
     Zero,
     /// Mean of the codes of the pixels of a splat, weighted by its blending weights.
     Lifted,
-    /// Linear least squares of the blended features against the codes of all labelled pixels.
-    LeastSquares,
 }
 
 /// Options of [`super::train_language`].

@@ -14,7 +14,7 @@ use super::views::Views;
 use crate::gpu::{Device, Recorder};
 use crate::pass::metrics::psnr_masked;
 use crate::pass::options::{FeatureMode, RasterOptions};
-use crate::pass::{compact, regularise, ssim_l1::ImageLoss};
+use crate::pass::{compact, ssim_l1::ImageLoss};
 use crate::progress::Progress;
 use crate::scene::{Camera, Coverage, DepthMap, Outside, PointCloud, RgbImage, Splats};
 use crate::{Error, Result};
@@ -27,8 +27,6 @@ mod tests;
 /// Upper bound of PSNR, dB: above the rounding noise of 8-bit photos, 10·log10(12·255²) = 58.9 dB,
 /// so that a render that happens to match exactly does not outweigh all other views.
 pub(crate) const MOST_PSNR: f64 = 60.0;
-/// Scale ratios above this are penalised (docs/internals/method.md#regularisers).
-const RATIO_LIMIT: f32 = 8.0;
 
 /// One point of the training curve.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -175,11 +173,6 @@ impl Photos<'_> {
     }
 }
 
-/// Depth maps with their least confidence, if the depth loss is on.
-fn depth_inputs<'d>(depths: Option<&'d [DepthMap]>, options: &RgbOptions) -> Option<(&'d [DepthMap], f32)> {
-    depths.filter(|_| options.depth_weight > 0.0).map(|d| (d, options.min_confidence))
-}
-
 /// One fit.
 pub(crate) struct Run<'a> {
     trainer: Trainer,
@@ -224,7 +217,7 @@ impl<'a> Run<'a> {
             feature_mode: FeatureMode::Linear,
             features_move_geometry: true,
         };
-        let depths = depth_inputs(first.depths, options);
+        let depths = options.losses.depth_inputs(first.depths).map(|d| (d, options.min_confidence));
         let Photos { images, cameras, coverage, .. } = first;
         let views = Views::new(device, images, cameras, depths, coverage, start.len(), 0, scale.near())?;
         let model = Model::new(device, start, 0)?;
@@ -250,7 +243,8 @@ impl<'a> Run<'a> {
             return Ok(());
         }
         let (t, Photos { images, cameras, depths, coverage }) = (&mut self.trainer, self.photos);
-        let (depths, near) = (depth_inputs(depths, self.options), self.scale.near());
+        let depths = self.options.losses.depth_inputs(depths).map(|d| (d, self.options.min_confidence));
+        let near = self.scale.near();
         t.views = Views::new(&t.device, images, cameras, depths, coverage, t.model.count(), 0, near)?;
         for (own, camera) in t.cameras.iter_mut().zip(cameras) {
             *own = Camera { pose: own.pose, ..camera.clone() };
@@ -284,7 +278,7 @@ impl<'a> Run<'a> {
         self.psnr[self.last] = Some(photos.psnr(self.last, &rendered));
         let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
         let n = self.recent.len().max(1) as f64;
-        let total = |l: &ImageLoss| l.total(self.options.l1_weight, self.options.dssim_weight);
+        let total = |l: &ImageLoss| self.options.losses.photos(l);
         let point = CurvePoint {
             step,
             loss: self.recent.iter().map(total).sum::<f64>() / n,
@@ -379,32 +373,13 @@ impl Training for Run<'_> {
         let frame = stage.raster.frame();
         let mut rec = Recorder::new(device, "rgb step");
         stage.raster.record_projection(&mut rec, &model.values, raster);
-        let weights = [self.options.l1_weight, self.options.dssim_weight];
         for band in frame.bands.iter() {
             stage.raster.record_band(&mut rec, &model.values, &band);
-            let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
-            let gradient = &frame.planes_grad;
-            stage.loss.record(&mut rec, &band, &frame.planes, target, gradient, item.covered, weights, sums);
-            // A view without depth clears the gradients of another view of its size.
-            let (reference, pixels) = match &item.depth {
-                Some((references, count)) => (Some(&references[band.index]), *count as f64),
-                None => (None, 1.0),
-            };
-            regularise::record_depth(&mut rec, frame, reference, self.options.depth_weight / pixels);
-            if let Some(alpha) = &item.alpha {
-                // Weighted as one more channel of the L1 loss.
-                let weight = self.options.l1_weight / f64::from(frame.width * frame.height);
-                regularise::record_alpha(&mut rec, frame, &alpha[band.index], weight);
-            }
+            self.options.losses.record_image(&mut rec, stage, item, &band);
             stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
         }
         stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
-        if self.options.ratio_weight > 0.0 {
-            let count = model.count();
-            let (values, gradients) = (&model.values.log_scales, &model.gradients.log_scales);
-            let weight = self.options.ratio_weight / count as f64;
-            regularise::record_ratio(&mut rec, values, gradients, count, weight, RATIO_LIMIT);
-        }
+        self.options.losses.record_parameters(&mut rec, model);
         model.record_step(&mut rec, &frame.status);
         rec.download(&frame.status);
         rec.download(&stage.sums);
@@ -453,5 +428,5 @@ impl Training for Run<'_> {
 
 /// Number of first steps with the photos at half resolution.
 fn half_res_steps(options: &RgbOptions) -> usize {
-    (options.coarse * options.iterations as f64) as usize
+    (options.half_res * options.iterations as f64) as usize
 }

@@ -2,6 +2,7 @@
 //! trained geometry, of the degree that left-out photos support.
 use super::half_res::Photos;
 use super::init::raise_sh_degree;
+use super::losses::Losses;
 use super::options::{Rates, RgbOptions};
 use super::rgb::{Trained, fit_photos};
 use super::scale::SceneScale;
@@ -115,9 +116,8 @@ impl Fit<'_> {
             iterations,
             seed: self.options.seed,
             rates: Rates { sh_dc: self.options.rates[0], sh_rest: self.options.rates[1], ..Rates::STILL },
-            coarse: 0.0,
-            depth_weight: 0.0,
-            ratio_weight: 0.0,
+            half_res: 0.0,
+            losses: Losses::PHOTOS,
             bounded: false,
             prune_every: 0,
             poses: None,

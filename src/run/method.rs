@@ -71,15 +71,8 @@ pub static LIFT: Method = Method {
     recipe: Recipe { language: LanguageFit::Lift, ..OURS },
 };
 
-/// Closed form: least squares with a prior at that mean.
-pub static LIFT_LEAST_SQUARES: Method = Method {
-    name: "lift-ls",
-    about: "Alignment and codes as sparselgs; features by regularised least squares over all pixels",
-    recipe: Recipe { language: LanguageFit::LeastSquares, ..OURS },
-};
-
 /// What `--method` takes. [`Method::by_default`] is one of the first two.
-pub static METHODS: [&Method; 6] = [&SPARSELGS, &LIFT, &LIFT_LEAST_SQUARES, &LANGSPLAT, &LEGAUSSIANS, &LSM];
+pub static METHODS: [&Method; 5] = [&SPARSELGS, &LIFT, &LANGSPLAT, &LEGAUSSIANS, &LSM];
 
 /// How splats get their features.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -89,8 +82,6 @@ pub enum LanguageFit {
     Train,
     /// One pass per photo, sum and normalise.
     Lift,
-    /// The regularised least-squares solution.
-    LeastSquares,
 }
 
 const OURS: Recipe = Recipe {
@@ -218,7 +209,6 @@ impl Recipe {
         match self.language {
             LanguageFit::Train => {}
             LanguageFit::Lift => (options.iterations, options.start) = (0, Start::Lifted),
-            LanguageFit::LeastSquares => (options.iterations, options.start) = (0, Start::LeastSquares),
         }
         options
     }
@@ -297,13 +287,10 @@ mod tests {
         assert_eq!(ours.rgb(RgbOptions::preset(Preset::Draft)), RgbOptions::preset(Preset::Draft));
         let build = ours.build("x", 3);
         assert_eq!(build, BuildOptions { space: "x".into(), seed: 3, ..BuildOptions::default() });
-        for method in [&LIFT, &LIFT_LEAST_SQUARES] {
-            let recipe = Recipe { language: LanguageFit::Train, ..method.recipe };
-            assert_eq!(recipe, ours, "{}", method.name);
-            let start = method.recipe.language(preset.clone());
-            let expected = LanguageOptions { iterations: 0, start: start.start, ..preset.clone() };
-            assert_eq!(start, expected, "{}", method.name);
-        }
+        let recipe = Recipe { language: LanguageFit::Train, ..LIFT.recipe };
+        assert_eq!(recipe, ours);
+        let expected = LanguageOptions { iterations: 0, start: Start::Lifted, ..preset.clone() };
+        assert_eq!(LIFT.recipe.language(preset.clone()), expected);
         for method in [&LANGSPLAT, &LEGAUSSIANS, &LSM] {
             let recipe = method.recipe;
             let align = recipe.build("x", 0).align;

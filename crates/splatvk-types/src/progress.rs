@@ -1,4 +1,4 @@
-//! Progress of long work, and the request that it should stop.
+//! Progress and cancellation of long work.
 use crate::checkpoint::Checkpoint;
 use crate::sync::lock;
 use crate::{Error, Result};
@@ -18,26 +18,26 @@ pub trait Progress: Send + Sync {
     fn figures(&self, _step: u64, _figures: &[(&str, f64)]) {}
     /// The current stage is over.
     fn end(&self);
-    /// Something the user should know, one line.
+    /// A warning for the user, one line.
     fn warn(&self, message: &str);
-    /// What was decided for the user and is as it should be, one line. Hosts that keep this default
-    /// get it as a warning.
+    /// A decision that was made for the user and needs no action, one line. Hosts that keep this
+    /// default receive it as a warning.
     fn inform(&self, message: &str) {
         self.warn(message);
     }
-    /// True once the caller has requested that the work stops.
+    /// True once the caller has requested a stop.
     fn cancelled(&self) -> bool {
         false
     }
-    /// `Err(Error::Cancelled)` once the caller has requested that the work stops.
+    /// `Err(Error::Cancelled)` once the caller has requested a stop.
     fn check(&self) -> Result<()> {
         if self.cancelled() { Err(Error::Cancelled) } else { Ok(()) }
     }
-    /// Where long work keeps its state, if it is kept at all.
+    /// Checkpoint of long work, if its state is saved.
     fn checkpoint(&self) -> Option<&Checkpoint> {
         None
     }
-    /// Progress of work that goes on in parallel to this one: stages of the two lanes do not end
+    /// Progress of work in a second lane, parallel to this one: stages of the two lanes do not end
     /// each other. Hosts that show one stage at a time keep this default, which ignores the second
     /// lane.
     fn second_lane(&self) -> Box<dyn Progress + '_> {
@@ -56,21 +56,21 @@ impl Progress for Silent {
 }
 
 /// Time and memory of one stage.
-#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Debug, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct StageRecord {
     /// Stage name.
     pub name: String,
-    /// When it began, wall seconds since the run did. Stages overlap where they can.
+    /// Start, wall seconds since the start of the run. Stages may overlap.
     pub start: f64,
     /// Wall seconds.
     pub seconds: f64,
-    /// Peak resident memory of the process up to the end of the stage, bytes; 0 where the system
-    /// does not tell.
+    /// Peak resident memory of the process up to the end of the stage, bytes; 0 on systems without
+    /// that figure.
     pub peak_memory: u64,
 }
 
-/// Passes everything on and keeps what run.json reports: times and memory per stage, and the
-/// warnings.
+/// Forwards all progress and records for run.json: times and memory per stage, and the warnings.
+/// Stages, figures and messages are events of `tracing` as well (target `splatvk`).
 pub struct Recorded<'a> {
     inner: &'a dyn Progress,
     began: Instant,
@@ -80,12 +80,15 @@ pub struct Recorded<'a> {
     lane: Current,
 }
 
-/// The stage that one lane of work is in.
+/// Target of the events of `tracing`.
+const TARGET: &str = "splatvk";
+
+/// Current stage of a lane.
 #[derive(Default)]
 struct Current(Mutex<Option<(&'static str, Instant)>>);
 
 impl<'a> Recorded<'a> {
-    /// Records on the way to `inner`; the run begins now.
+    /// Records on the way to `inner`; the run starts now.
     pub fn new(inner: &'a dyn Progress) -> Self {
         Recorded {
             inner,
@@ -110,26 +113,29 @@ impl<'a> Recorded<'a> {
     pub fn warnings(&self) -> Vec<String> {
         lock(&self.warnings).clone()
     }
-    /// Warns of what matters more than all that was said before: it stands first among the
-    /// warnings.
+    /// Warns with a message that precedes all earlier warnings in the record.
     pub fn warn_first(&self, message: &str) {
+        tracing::warn!(target: TARGET, "{message}");
         lock(&self.warnings).insert(0, message.to_owned());
         self.inner.warn(message);
     }
-    /// Makes all work that reports here stop, because a part of it has failed.
+    /// Stops all work that reports here, because a part of it has failed.
     pub fn stop(&self) {
         self.stopped.store(true, Ordering::SeqCst);
     }
     fn open(&self, lane: &Current, stage: &'static str) {
         self.close(lane);
+        tracing::info!(target: TARGET, stage, "begin");
         *lock(&lane.0) = Some((stage, Instant::now()));
     }
     fn close(&self, lane: &Current) {
         let Some((name, start)) = lock(&lane.0).take() else { return };
+        let seconds = start.elapsed().as_secs_f64();
+        tracing::info!(target: TARGET, stage = name, seconds, "end");
         lock(&self.stages).push(StageRecord {
             name: name.to_owned(),
             start: start.duration_since(self.began).as_secs_f64(),
-            seconds: start.elapsed().as_secs_f64(),
+            seconds,
             peak_memory: peak_memory(),
         });
     }
@@ -144,6 +150,7 @@ impl Progress for Recorded<'_> {
         self.inner.step(done, note);
     }
     fn figures(&self, step: u64, figures: &[(&str, f64)]) {
+        tracing::debug!(target: TARGET, step, ?figures);
         self.inner.figures(step, figures);
     }
     fn end(&self) {
@@ -151,10 +158,12 @@ impl Progress for Recorded<'_> {
         self.inner.end();
     }
     fn warn(&self, message: &str) {
+        tracing::warn!(target: TARGET, "{message}");
         lock(&self.warnings).push(message.to_owned());
         self.inner.warn(message);
     }
     fn inform(&self, message: &str) {
+        tracing::info!(target: TARGET, "{message}");
         self.inner.inform(message);
     }
     fn cancelled(&self) -> bool {
@@ -181,6 +190,7 @@ impl Progress for SecondLane<'_> {
         self.inner.step(done, note);
     }
     fn figures(&self, step: u64, figures: &[(&str, f64)]) {
+        tracing::debug!(target: TARGET, step, ?figures);
         self.inner.figures(step, figures);
     }
     fn end(&self) {
@@ -191,6 +201,7 @@ impl Progress for SecondLane<'_> {
         self.owner.warn(message);
     }
     fn inform(&self, message: &str) {
+        tracing::info!(target: TARGET, "{message}");
         self.inner.inform(message);
     }
     fn cancelled(&self) -> bool {
@@ -209,7 +220,7 @@ pub fn peak_memory() -> u64 {
     kilobytes.unwrap_or(0) * 1024
 }
 
-/// Starts [`peak_memory`] afresh from what is resident now, where the system can.
+/// Resets [`peak_memory`] to the current resident memory, where the system can.
 pub fn reset_peak_memory() {
     // "5" resets the high-water mark (proc(5)); elsewhere the peak stays that of the whole process.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
@@ -220,7 +231,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn stages_are_recorded_in_order_and_warnings_are_kept() {
+    fn recorded_keeps_stages_and_warnings() {
         let recorded = Recorded::new(&Silent);
         recorded.begin("train", 10);
         recorded.step(5, "PSNR 20.0");
@@ -245,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn lanes_overlap_and_a_failure_of_one_stops_both() {
+    fn stop_of_recorded_reaches_both_lanes() {
         let recorded = Recorded::new(&Silent);
         let second = recorded.second_lane();
         recorded.begin("splats", 1);
@@ -263,5 +274,45 @@ mod tests {
         assert!(second.check().is_ok());
         recorded.stop();
         assert!(second.check().is_err() && recorded.check().is_err());
+    }
+
+    /// Collects the fields of every event.
+    struct Collector(Mutex<Vec<String>>);
+
+    impl tracing::Subscriber for Collector {
+        fn enabled(&self, metadata: &tracing::Metadata<'_>) -> bool {
+            metadata.target() == TARGET
+        }
+        fn new_span(&self, _: &tracing::span::Attributes<'_>) -> tracing::span::Id {
+            tracing::span::Id::from_u64(1)
+        }
+        fn record(&self, _: &tracing::span::Id, _: &tracing::span::Record<'_>) {}
+        fn record_follows_from(&self, _: &tracing::span::Id, _: &tracing::span::Id) {}
+        fn event(&self, event: &tracing::Event<'_>) {
+            let mut text = event.metadata().level().to_string();
+            event.record(&mut |field: &tracing::field::Field, value: &dyn std::fmt::Debug| {
+                text += &format!(" {field}={value:?}");
+            });
+            lock(&self.0).push(text);
+        }
+        fn enter(&self, _: &tracing::span::Id) {}
+        fn exit(&self, _: &tracing::span::Id) {}
+    }
+
+    #[test]
+    fn recorded_emits_tracing_events() {
+        let collector = std::sync::Arc::new(Collector(Mutex::default()));
+        tracing::subscriber::with_default(collector.clone(), || {
+            let recorded = Recorded::new(&Silent);
+            recorded.begin("splats", 2);
+            recorded.figures(1, &[("psnr", 20.0)]);
+            recorded.warn("few matches");
+            recorded.end();
+        });
+        let events = lock(&collector.0).clone();
+        assert_eq!(events[0], r#"INFO message=begin stage="splats""#);
+        assert_eq!(events[1], r#"DEBUG step=1 figures=[("psnr", 20.0)]"#);
+        assert_eq!(events[2], "WARN message=few matches");
+        assert!(events[3].starts_with(r#"INFO message=end stage="splats" seconds="#), "{events:?}");
     }
 }

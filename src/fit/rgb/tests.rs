@@ -27,7 +27,7 @@ fn full_resolution_steps_keep_refined_poses() {
     let device = test_device();
     let (splats, cameras, images) = scene(&device);
     let poses = Some(PoseOptions { start: 0, rate: Exponential::constant(1e-3) });
-    let options = RgbOptions { iterations: 10, coarse: 0.5, poses, ..RgbOptions::preset(Preset::Draft) };
+    let options = RgbOptions { iterations: 10, half_res: 0.5, poses, ..RgbOptions::preset(Preset::Draft) };
     let scale = SceneScale::measure(&cameras, &splats.means);
     let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
     let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
@@ -46,7 +46,7 @@ fn full_resolution_steps_keep_refined_poses() {
 fn worse_refined_cameras_are_discarded() {
     let device = test_device();
     let (splats, cameras, images) = scene(&device);
-    let options = RgbOptions { coarse: 0.0, bounded: false, ..RgbOptions::preset(Preset::Draft) };
+    let options = RgbOptions { half_res: 0.0, bounded: false, ..RgbOptions::preset(Preset::Draft) };
     let scale = SceneScale::measure(&cameras, &splats.means);
     let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
     let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
@@ -71,7 +71,7 @@ fn unused_pixels_do_not_train_splats() {
     let coverage: Vec<_> = cameras.iter().map(|_| Some(left_half(75, 53, Outside::Unknown))).collect();
     let options = RgbOptions {
         iterations: 12,
-        coarse: 0.5,
+        half_res: 0.5,
         poses: None,
         bounded: false,
         prune_every: 0,
