@@ -3,6 +3,20 @@
 //! Networks of users are recognised by their inputs and outputs: [`onnx`] reads a file's header,
 //! [`contract`] states the interface of each part of a model, [`adapter`] maps a file's names to
 //! it, [`graph`] runs it by role.
+//!
+//! ```no_run
+//! use splatvk_infer::{Registry, hed::Hed};
+//! use splatvk_types::scene::RgbImage;
+//!
+//! # fn main() -> splatvk_types::Result<()> {
+//! // The folder where `tools/setup` and `splatvk models fetch` install.
+//! let registry = Registry::open(None)?;
+//! let image = RgbImage { width: 64, height: 48, data: vec![[0.5; 3]; 64 * 48] };
+//! let edges = Hed::load(&registry)?.edges(&image)?;
+//! println!("{} × {}", edges.width, edges.height);
+//! # Ok(())
+//! # }
+//! ```
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]
 

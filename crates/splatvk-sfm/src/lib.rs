@@ -7,6 +7,25 @@
 //!   through [`stereo::PlaneSweep`]: splatvk implements it on Vulkan.
 //! - [`pointmap`] aligns pointmaps of networks such as MASt3R globally.
 //! - [`upright`] finds the direction against gravity.
+//!
+//! ```no_run
+//! use splatvk_io::photo;
+//! use splatvk_sfm::{Keypoints, place};
+//! use splatvk_types::progress::Silent;
+//! use splatvk_types::scene::RgbImage;
+//!
+//! # fn my_detector(_: &RgbImage) -> splatvk_types::Result<Keypoints> { Ok(Keypoints::default()) }
+//! # fn main() -> splatvk_types::Result<()> {
+//! let files = ["a.jpg", "b.jpg", "c.jpg"];
+//! let photos = files.iter().map(|f| photo::load(f.as_ref())).collect::<Result<Vec<_>, _>>()?;
+//! // Any detector: a closure from an image to keypoints with descriptors.
+//! let solved = place(photos, None, &mut my_detector, 0, &Silent)?;
+//! for (camera, fitted) in solved.model.cameras.iter().zip(&solved.model.fitted) {
+//!     println!("{}: f = {:.1} px ± {:.1} %", camera.name, camera.fx, 100.0 * fitted.sigmas[0]);
+//! }
+//! # Ok(())
+//! # }
+//! ```
 
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]
