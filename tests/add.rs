@@ -1,4 +1,4 @@
-//! Photos that join a scene: `splatvk run --add`.
+//! Adding photos to a scene: `splatvk run --add`.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 mod fixture;
 
@@ -10,7 +10,7 @@ use splatvk::scene::{Camera, Pose};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// Width of the photos here: a run takes seconds, and a lemon is still one.
+/// Width of the photos: a run takes seconds, and a lemon is still recognised.
 const WIDTH: u32 = 320;
 
 struct Scene {
@@ -18,7 +18,7 @@ struct Scene {
 }
 
 impl Scene {
-    /// Three photos of breakfast in `photos/`, and beside them those that come later.
+    /// Scene with three photos of breakfast in `photos/`.
     fn new() -> Scene {
         let scene = Scene { folder: tempfile::tempdir().unwrap() };
         std::fs::create_dir(scene.at("photos")).unwrap();
@@ -48,8 +48,8 @@ impl Scene {
 
     fn succeeds(&self, arguments: &[&str]) -> Value {
         let out = self.run(arguments);
-        let said = String::from_utf8_lossy(&out.stderr);
-        assert!(out.status.success(), "{arguments:?}: {said}");
+        let stderr = String::from_utf8_lossy(&out.stderr);
+        assert!(out.status.success(), "{arguments:?}: {stderr}");
         serde_json::from_slice(&out.stdout).unwrap()
     }
 
@@ -62,30 +62,29 @@ impl Scene {
     }
 }
 
-/// True cameras of the photos of that name, at any resolution: their poses are compared.
+/// True cameras of the photos with these names; only their poses are compared.
 fn truth(names: &[&str]) -> Vec<Camera> {
     let json = fixture::truth();
-    let one = |name: &&str| {
-        let frames = json["frames"].as_array().unwrap();
-        let frame = frames.iter().find(|f| f["file"].as_str().unwrap().contains(*name)).unwrap();
-        let m = |r: usize, c: usize| frame["world_to_camera"][r][c].as_f64().unwrap();
-        let column = |c: usize| DVec3::new(m(0, c), m(1, c), m(2, c));
-        let k = |name: &str| frame[name].as_f64().unwrap() * f64::from(WIDTH) / 640.0;
-        Camera {
-            name: name.to_string(),
-            width: WIDTH,
-            height: WIDTH * 3 / 4,
-            fx: k("fx"),
-            fy: k("fy"),
-            cx: k("cx"),
-            cy: k("cy"),
-            pose: Pose {
-                rotation: DMat3::from_cols(column(0), column(1), column(2)),
-                translation: column(3),
-            },
-        }
-    };
-    names.iter().map(one).collect()
+    names.iter().map(|name| true_camera(&json, name)).collect()
+}
+
+/// True camera of a photo, scaled to the width of the test.
+fn true_camera(json: &serde_json::Value, name: &str) -> Camera {
+    let frames = json["frames"].as_array().unwrap();
+    let frame = frames.iter().find(|f| f["file"].as_str().unwrap().contains(name)).unwrap();
+    let m = |r: usize, c: usize| frame["world_to_camera"][r][c].as_f64().unwrap();
+    let column = |c: usize| DVec3::new(m(0, c), m(1, c), m(2, c));
+    let k = |name: &str| frame[name].as_f64().unwrap() * f64::from(WIDTH) / 640.0;
+    Camera {
+        name: name.to_string(),
+        width: WIDTH,
+        height: WIDTH * 3 / 4,
+        fx: k("fx"),
+        fy: k("fy"),
+        cx: k("cx"),
+        cy: k("cy"),
+        pose: Pose { rotation: DMat3::from_cols(column(0), column(1), column(2)), translation: column(3) },
+    }
 }
 
 /// PSNR of a held-out view by `splatvk eval`, dB.
@@ -103,7 +102,7 @@ fn found(record: &Value) -> u64 {
 
 #[test]
 #[ignore = "takes long: tools/test-long"]
-fn a_photo_joins_a_scene_that_stays_as_it_was() {
+fn run_add_keeps_existing_scene() {
     let scene = Scene::new();
     let settings = ["--preset", "draft", "--iterations", "80", "--language-iterations", "4", "--json"];
     let made =
@@ -111,7 +110,7 @@ fn a_photo_joins_a_scene_that_stays_as_it_was() {
     let later = scene.photo("held_out/test_06", scene.folder.path());
     let before = std::fs::read(scene.at("cup/run.json")).unwrap();
 
-    // What is not of this place is refused by name, and nothing is left of it.
+    // An unrelated photo is refused by name, and leaves no files.
     let stripes = image::RgbImage::from_fn(WIDTH, WIDTH * 3 / 4, |x, y| {
         let v = ((x * x / 7 + y * 13) % 251) as u8;
         image::Rgb([v, v.wrapping_mul(3), 255 - v])
@@ -119,12 +118,12 @@ fn a_photo_joins_a_scene_that_stays_as_it_was() {
     stripes.save(scene.at("elsewhere.png")).unwrap();
     let names = scene.names();
     let out = scene.run(&["run", "--add", "cup", "elsewhere.png"]);
-    let said = String::from_utf8_lossy(&out.stderr).into_owned();
-    assert_eq!(out.status.code(), Some(2), "{said}");
-    assert!(said.contains("elsewhere"), "{said}");
+    let stderr = String::from_utf8_lossy(&out.stderr).into_owned();
+    assert_eq!(out.status.code(), Some(2), "{stderr}");
+    assert!(stderr.contains("elsewhere"), "{stderr}");
     assert_eq!(scene.names(), names);
 
-    // One that is there already, too.
+    // A photo that is in the scene already is refused, too.
     let out = scene.run(&["run", "--add", "cup", "photos/train_01.png"]);
     assert_eq!(out.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&out.stderr).contains("train_01"));
@@ -134,7 +133,7 @@ fn a_photo_joins_a_scene_that_stays_as_it_was() {
     let (old, new) =
         (scene_dir::load(&scene.at("cup")).unwrap(), scene_dir::load(&scene.at("cup-2")).unwrap());
 
-    // The world frame, codes and what is known of the world stay; all cameras are right.
+    // The world frame, the codes and the world data stay; all cameras are accurate.
     assert_eq!(new.cameras.len(), 4);
     let (a, b) = (&old.cameras[0].pose, &new.cameras[0].pose);
     assert!((a.centre() - b.centre()).length() < 1e-9 && a.rotation.abs_diff_eq(b.rotation, 1e-9));
@@ -161,26 +160,26 @@ fn a_photo_joins_a_scene_that_stays_as_it_was() {
     println!("{own}");
     assert_eq!((&own["photo"], &own["confidence"]), (&"test_06".into(), &"high".into()));
 
-    // Views near the new photo are shown better than before.
+    // Views near the new photo are rendered better than before.
     let [a, b] = ["cup", "cup-2"].map(|name| held_out(&scene, name, "test_07"));
     println!("test_07: {a:.2} dB from three photos, {b:.2} dB with test_06");
     assert!(b > a, "{a} {b}");
 }
 
 #[test]
-fn scenes_that_cannot_go_on_are_refused_with_the_reason() {
+fn run_add_refuses_unsuitable_scenes() {
     let scene = Scene::new();
-    let refused = |arguments: &[&str], says: &str| {
+    let assert_refused = |arguments: &[&str], words: &str| {
         let out = scene.run(arguments);
-        let said = String::from_utf8_lossy(&out.stderr).into_owned();
-        assert!(out.status.code() == Some(2) && said.contains(says), "{arguments:?}: {said}");
+        let stderr = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert!(out.status.code() == Some(2) && stderr.contains(words), "{arguments:?}: {stderr}");
     };
-    refused(&["run", "--add", "nowhere", "photos"], "run.json");
-    refused(&["run", "--add", "cup", "photos", "--init", "sfm"], "--init");
+    assert_refused(&["run", "--add", "nowhere", "photos"], "run.json");
+    assert_refused(&["run", "--add", "cup", "photos", "--init", "sfm"], "--init");
     std::fs::create_dir(scene.at("cup")).unwrap();
     std::fs::write(scene.at("cup/run.json"), r#"{"config": {"plan": {"method": "langsplat"}}}"#).unwrap();
-    refused(&["run", "--add", "cup", "photos"], "--method langsplat");
+    assert_refused(&["run", "--add", "cup", "photos"], "--method langsplat");
     std::fs::write(scene.at("cup/run.json"), r#"{"config": {"plan": {"images": "photos"}}}"#).unwrap();
-    refused(&["run", "--add", "cup", "photos"], "splatvk train");
+    assert_refused(&["run", "--add", "cup", "photos"], "splatvk train");
     assert_eq!(scene.names(), ["cup", "photos"]);
 }

@@ -1,5 +1,5 @@
-//! `splatvk bench` on small scenes: its figures fit together, its files are read back, and it
-//! refuses what it cannot use.
+//! `splatvk bench` on small scenes: its figures are consistent, its files are read back, and
+//! unusable arguments are refused.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use splatlab::generate::regions::InjectedErrors;
 use splatlab::generate::{Effects, SceneSpec, generate};
@@ -16,7 +16,7 @@ fn is_ordered(s: &Quartiles) -> bool {
     0.0 < s.best && s.best <= s.lower_quartile && s.lower_quartile <= s.median && s.median <= s.upper_quartile
 }
 
-/// The rows of a section of training steps fit together.
+/// Checks that the rows of a section of training steps are consistent.
 fn check_step(section: &Section, expected: &[&str]) {
     let sum = section.row(SUM).unwrap();
     let at = section.rows.iter().position(|r| r.name == SUM).unwrap();
@@ -24,14 +24,14 @@ fn check_step(section: &Section, expected: &[&str]) {
     let names: Vec<&str> = passes.iter().map(|r| r.name.as_str()).collect();
     assert_eq!(names, expected);
     assert!(section.rows.iter().all(|r| is_ordered(&r.ms) && r.ms.runs == 3), "{section:?}");
-    // What a pass is made of takes together what the pass takes.
+    // The commands of a pass add up to the time of the pass.
     for pass in passes {
         let own = section.commands.iter().filter(|c| c.pass == pass.name);
         let best = own.map(|c| (c.count, c.ms.best)).fold((0, 0.0), |sum, c| (sum.0 + c.0, sum.1 + c.1));
         assert!(best.0 > 0 && best.1 > 0.0 && best.1 <= pass.ms.best * (1.0 + 1e-9), "{pass:?}");
     }
     let best: f64 = passes.iter().map(|r| r.ms.best).sum();
-    // The best sum is one run's; each pass can only have been faster in another.
+    // The best sum is that of one run; each pass may have been faster in another.
     assert!(sum.ms.best >= best - 1e-9, "{} < {best}", sum.ms.best);
     let bytes: f64 = passes.iter().filter_map(|r| r.bytes).sum();
     let step = section.row("training step").unwrap();
@@ -48,7 +48,7 @@ fn check_step(section: &Section, expected: &[&str]) {
 }
 
 #[test]
-fn a_training_step_adds_up() {
+fn bench_training_times_add_up() {
     // A device of its own: it counts the buffers of everything that runs on it.
     let device = TestDevice::open(&gpu::options(None)).unwrap();
     let mut bench = Bench::new(&device, ONCE).unwrap();
@@ -74,7 +74,7 @@ fn a_training_step_adds_up() {
 }
 
 #[test]
-fn sort_and_growth() {
+fn bench_measures_sort_and_growth() {
     let device = test_device();
     let mut bench = Bench::new(&device, ONCE).unwrap();
     bench.sort(3000).unwrap();
@@ -90,7 +90,7 @@ fn sort_and_growth() {
 }
 
 #[test]
-fn reports_are_read_back_and_compared() {
+fn bench_compares_reports() {
     let device = test_device();
     let folder = tempfile::tempdir().unwrap();
     let mut a = BenchReport::new(&device);
@@ -134,7 +134,7 @@ fn splatvk(args: &[&str]) -> std::process::Output {
         .unwrap()
 }
 
-/// Exit code 2 and one line that contains the word.
+/// Expects exit code 2 and one line that contains the word.
 fn refuses(args: &[&str], word: &str) {
     let output = splatvk(args);
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -143,7 +143,7 @@ fn refuses(args: &[&str], word: &str) {
 }
 
 #[test]
-fn what_cannot_be_measured_is_refused_at_once() {
+fn bench_refuses_unusable_arguments() {
     refuses(&["bench", "--features", "17"], "--features 17");
     refuses(&["bench", "--seconds", "0"], "--seconds 0");
     refuses(&["bench", "--repeats", "0"], "--repeats 0");
@@ -158,7 +158,7 @@ fn what_cannot_be_measured_is_refused_at_once() {
 }
 
 #[test]
-fn a_written_scene_is_the_scene_that_was_measured() {
+fn bench_writes_measured_scene() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("scene");
     let size = ["--splats", "300", "--width", "64", "--height", "48", "--sh-degree", "1"];
@@ -191,7 +191,7 @@ fn a_written_scene_is_the_scene_that_was_measured() {
 /// Two photos whose axes meet at equal distances: matches leave their focal length open (without
 /// vanishing points it comes out 36 % short, and the rotation between them 17° wrong).
 #[test]
-fn right_angles_give_the_focal_length() {
+fn bench_cameras_recovers_focal_length() {
     let folder = tempfile::tempdir().unwrap();
     let (data, table) = (folder.path().join("data"), folder.path().join("table.json"));
     let spec = SceneSpec {

@@ -1,8 +1,8 @@
-//! An outside check: two small scenes with images rendered by gsplat, from the test cases of Brush
-//! (<https://github.com/ArthurBrussee/brush>, Apache-2.0, see tests/data/formats/LICENSE).
+//! Comparison with gsplat: two small scenes with images rendered by gsplat, from the test cases of
+//! Brush (<https://github.com/ArthurBrussee/brush>, Apache-2.0, see tests/data/formats/LICENSE).
 //!
-//! The files hold raw parameters (degree 3, opacity logits) and the image; the camera is Brush's
-//! test convention: at (0.123, 0.456, −8) without rotation, 90° across the width, square pixels,
+//! The files contain raw parameters (degree 3, opacity logits) and the image; the camera follows
+//! Brush's tests: at (0.123, 0.456, −8) without rotation, 90° across the width, square pixels,
 //! black background.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // helpers of tests
 mod support;
@@ -45,8 +45,8 @@ fn load(name: &str) -> (Scene, Vec<f32>) {
     (scene, floats(&file, "out_img"))
 }
 
-/// Two f32 renderers of one formula: measured 8e-7, allowed ten times that. Any other convention
-/// for the camera, pixel centres, SH order, dilation or cut-offs shows at 1e-3 or more.
+/// Two f32 renderers of one formula: measured 8e-7, permitted ten times that. Any other convention
+/// of camera, pixel centres, SH order, dilation or cut-offs causes 1e-3 or more.
 const BOUND: f32 = 1e-5;
 
 #[test]

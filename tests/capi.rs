@@ -1,5 +1,5 @@
-//! The C header is what the code says; what its functions make of names and settings. `tools/hosts`
-//! has the rest.
+//! The C header is up to date; the C functions handle names and settings. `tools/hosts` tests the
+//! rest.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::undocumented_unsafe_blocks)] // a panic is how a test fails
 mod fixture;
 
@@ -9,7 +9,7 @@ use std::path::Path;
 use std::ptr::{null, null_mut};
 
 #[test]
-fn the_header_is_generated_from_the_code() {
+fn header_matches_code() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut builder = cbindgen::Builder::new()
         .with_config(cbindgen::Config::from_file(root.join("cbindgen.toml")).unwrap());
@@ -31,8 +31,8 @@ fn text(path: &Path) -> CString {
     CString::new(path.to_str().unwrap()).unwrap()
 }
 
-/// The text of a failure, by the function that copies it.
-fn said(copy: impl Fn(*mut c_char, usize) -> usize) -> String {
+/// Text of a failure, from the function that copies it.
+fn error_text(copy: impl Fn(*mut c_char, usize) -> usize) -> String {
     let mut bytes = vec![0u8; copy(null_mut(), 0)];
     copy(bytes.as_mut_ptr().cast(), bytes.len());
     bytes.pop();
@@ -50,7 +50,7 @@ fn context(provider: Option<&CString>) -> *mut SvkContext {
 }
 
 #[test]
-fn a_name_with_an_unknown_ending_is_refused_and_no_folder_of_it_is_made() {
+fn export_refuses_unknown_ending() {
     let folder = tempfile::tempdir().unwrap();
     let context = context(None);
     let mut scene = null_mut();
@@ -63,8 +63,8 @@ fn a_name_with_an_unknown_ending_is_refused_and_no_folder_of_it_is_made() {
     };
     for name in ["scene.foo", "scene.PLYX", "scene.v2"] {
         assert_eq!(save(name, 1), SvkStatus::Input);
-        let said = said(|out, bytes| unsafe { svk_scene_error(scene, out, bytes) });
-        assert!(said.contains(".compressed.ply, .ply") && said.contains("ends in a slash"), "{said}");
+        let error = error_text(|out, bytes| unsafe { svk_scene_error(scene, out, bytes) });
+        assert!(error.contains(".compressed.ply, .ply") && error.contains("ends in a slash"), "{error}");
     }
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
     assert_eq!(
@@ -78,18 +78,18 @@ fn a_name_with_an_unknown_ending_is_refused_and_no_folder_of_it_is_made() {
     assert!(["scene.v2", "scene"].iter().all(|n| folder.path().join(n).join("scene.json").is_file()));
     #[cfg(unix)]
     {
-        let at = |name: &str| folder.path().join(name);
+        let path_of = |name: &str| folder.path().join(name);
         for (link, target) in [("link.ply", "a.ply"), ("nowhere.ply", "nothing"), ("link", "scene")] {
-            std::os::unix::fs::symlink(at(target), at(link)).unwrap();
+            std::os::unix::fs::symlink(path_of(target), path_of(link)).unwrap();
             assert_eq!((save(link, 0), save(link, 1)), (SvkStatus::Input, SvkStatus::Input), "{link}");
-            let said = said(|out, bytes| unsafe { svk_scene_error(scene, out, bytes) });
-            assert!(said.contains("symbolic link") && at(link).is_symlink(), "{said}");
+            let error = error_text(|out, bytes| unsafe { svk_scene_error(scene, out, bytes) });
+            assert!(error.contains("symbolic link") && path_of(link).is_symlink(), "{error}");
         }
     }
-    // A folder that is not there is not made on the way to another one.
+    // No folder is created on the way to another one.
     assert_ne!(save("new/../b.ply", 0), SvkStatus::Ok);
     assert!(!folder.path().join("new").exists() && !folder.path().join("b.ply").exists());
-    // Somebody's file in a scene, and the scene that was loaded, stay.
+    // Another program's file in a scene, and the scene that was loaded, are kept.
     std::fs::write(folder.path().join("scene/user.txt"), "precious").unwrap();
     assert_eq!(save("scene", 1), SvkStatus::Input);
     assert!(folder.path().join("scene/user.txt").exists());
@@ -102,15 +102,15 @@ fn a_name_with_an_unknown_ending_is_refused_and_no_folder_of_it_is_made() {
     }
 }
 
-/// What is told of a camera goes back as it is, one camera after the other.
+/// A camera from the scene is accepted unchanged; one camera after the other.
 #[test]
-fn a_text_is_answered_in_the_view_of_the_camera_that_is_given() {
+fn query_answers_in_given_view() {
     let folder = tempfile::tempdir().unwrap();
     let (context, lemon) = (context(None), CString::new("lemon").unwrap());
     let path = text(&fixture::view::breakfast(folder.path()));
     let mut scene = null_mut();
     assert_eq!(unsafe { svk_scene_load(context, path.as_ptr(), &mut scene) }, SvkStatus::Ok);
-    // The lemon is elsewhere in each; its label is 7.
+    // The lemon has a different place in each; its label is 7.
     for (index, stem) in [(0, "train_00"), (1, "train_02")] {
         let mut camera: SvkCamera = unsafe { std::mem::zeroed() };
         let mut answer: SvkAnswer = unsafe { std::mem::zeroed() };
@@ -121,8 +121,8 @@ fn a_text_is_answered_in_the_view_of_the_camera_that_is_given() {
         let status = unsafe {
             svk_scene_query(scene, lemon.as_ptr(), &camera, &mut answer, mask.as_mut_ptr(), mask.len())
         };
-        let said = said(|out, bytes| unsafe { svk_scene_error(scene, out, bytes) });
-        assert_eq!((status, answer.found), (SvkStatus::Ok, 1), "{said}");
+        let error = error_text(|out, bytes| unsafe { svk_scene_error(scene, out, bytes) });
+        assert_eq!((status, answer.found), (SvkStatus::Ok, 1), "{error}");
         let pixels = |counts: fn(bool, bool) -> bool| {
             mask.iter().zip(&truth.data).filter(|(m, t)| counts(**m > 0, **t == 7)).count() as f64
         };
@@ -140,9 +140,9 @@ unsafe extern "C" fn stop(_: *mut c_void, _: *const SvkProgress) -> i32 {
 }
 
 #[test]
-fn two_contexts_do_not_share_their_provider() {
-    // No build of ONNX Runtime has both of the absent ones; the first context is there while the
-    // others are asked.
+fn contexts_keep_separate_providers() {
+    // No build of ONNX Runtime has both of the absent providers; the first context exists while the
+    // others are used.
     let providers = ["cpu", "directml", "coreml"].map(|name| CString::new(name).unwrap());
     let contexts = providers.each_ref().map(|provider| context(Some(provider)));
     let files: Vec<CString> =
@@ -160,7 +160,7 @@ fn two_contexts_do_not_share_their_provider() {
         let mut scene = null_mut();
         let status = unsafe { svk_train(contexts[k], photos.as_ptr(), 2, &options, &mut scene) };
         assert!(scene.is_null());
-        (status, said(|out, bytes| unsafe { svk_context_error(contexts[k], out, bytes) }))
+        (status, error_text(|out, bytes| unsafe { svk_context_error(contexts[k], out, bytes) }))
     });
     assert_eq!(outcomes[1].0, SvkStatus::Cancelled, "{}", outcomes[1].1);
     for (k, provider) in [(0, "provider directml"), (2, "provider coreml")] {

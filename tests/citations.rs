@@ -1,11 +1,11 @@
-//! Citations of the documents: every `docs/<folder>/<name>.md#<anchor>` in sources and documents,
-//! and every relative link of a Markdown file, leads to a file and a heading that exist. No
-//! compiler reads comments, so nothing else would notice a section that was renamed.
+//! Citations in the documents: every `docs/<folder>/<name>.md#<anchor>` in sources and documents,
+//! and every relative link of a Markdown file, leads to an existing file and heading. No compiler
+//! checks comments, so a renamed section would go unnoticed.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// What is read, relative to the repository.
+/// Searched places, relative to the repository.
 const PLACES: [&str; 13] = [
     "src",
     "crates",
@@ -22,14 +22,14 @@ const PLACES: [&str; 13] = [
     "build.rs",
 ];
 
-/// Fewer citations than this mean that they are no longer recognised.
+/// Fewer citations than this mean that the search is broken.
 const MIN_CITATIONS: usize = 50;
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Every text file of [`PLACES`] with its content; what is not UTF-8 is no text.
+/// Every text file of [`PLACES`] with its content; files that are not UTF-8 are skipped.
 fn texts() -> Vec<(PathBuf, String)> {
     let mut all = Vec::new();
     PLACES.iter().for_each(|place| collect(&root().join(place), &mut all));
@@ -47,12 +47,12 @@ fn collect(path: &Path, all: &mut Vec<(PathBuf, String)>) {
     }
 }
 
-/// "src/lib.rs:12".
+/// Place in a message: "src/lib.rs:12".
 fn place(path: &Path, line: usize) -> String {
     format!("{}:{line}", path.strip_prefix(root()).unwrap_or(path).display())
 }
 
-/// The letters, digits, `-`, `_` and characters of `more` that a text starts with.
+/// Leading letters, digits, `-`, `_` and characters of `more` of a text.
 fn word<'a>(text: &'a str, more: &str) -> &'a str {
     let end = text.find(|c: char| !(c.is_alphanumeric() || c == '-' || c == '_' || more.contains(c)));
     &text[..end.unwrap_or(text.len())]
@@ -90,13 +90,13 @@ fn prose(text: &str) -> Vec<(usize, &str)> {
     lines
 }
 
-/// The anchor that GitHub gives a heading: lower case, spaces to `-`, punctuation dropped.
+/// Anchor of a heading on GitHub: lower case, spaces to `-`, punctuation dropped.
 fn slug(heading: &str) -> String {
     let kept = heading.chars().filter(|c| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_'));
     kept.flat_map(char::to_lowercase).map(|c| if c == ' ' { '-' } else { c }).collect()
 }
 
-/// Anchors of a Markdown file; a heading that was there before gets a number.
+/// Anchors of a Markdown file; repeated headings get a number.
 fn anchors(text: &str) -> Vec<String> {
     let mut seen: BTreeMap<String, usize> = BTreeMap::new();
     let mut all = Vec::new();
@@ -113,7 +113,7 @@ fn anchors(text: &str) -> Vec<String> {
     all
 }
 
-/// What is wrong with a reference to a file, or to a heading of it.
+/// Fault of a reference to a file, or to a heading in it.
 fn fault(file: &Path, anchor: Option<&str>) -> Option<String> {
     if !file.exists() {
         return Some("there is no such file".to_owned());
@@ -125,7 +125,7 @@ fn fault(file: &Path, anchor: Option<&str>) -> Option<String> {
 }
 
 #[test]
-fn every_citation_leads_to_a_heading() {
+fn citations_lead_to_headings() {
     let (mut faults, mut count) = (Vec::new(), 0);
     for (path, text) in texts() {
         for (at, line) in text.lines().enumerate() {
@@ -141,7 +141,7 @@ fn every_citation_leads_to_a_heading() {
 }
 
 #[test]
-fn relative_links_lead_somewhere() {
+fn relative_links_lead_to_files() {
     let mut faults = Vec::new();
     for (path, text) in texts().iter().filter(|(p, _)| p.extension().is_some_and(|e| e == "md")) {
         for (at, line) in prose(text) {
@@ -155,10 +155,9 @@ fn relative_links_lead_somewhere() {
     assert!(faults.is_empty(), "{}", faults.join("\n"));
 }
 
-/// Nobody else can look into the document that comments cited before docs/internals/method.md was
-/// there.
+/// Comments once cited a document that is not public, before docs/internals/method.md existed.
 #[test]
-fn nothing_outside_the_repository_is_cited() {
+fn citations_stay_in_repository() {
     let word = ["ALGO", "RITHMS"].concat();
     let mut faults = Vec::new();
     for (path, text) in texts() {
@@ -169,7 +168,7 @@ fn nothing_outside_the_repository_is_cited() {
 }
 
 #[test]
-fn headings_become_the_anchors_that_github_makes() {
+fn headings_become_github_anchors() {
     assert_eq!(slug("Forward rasterisation"), "forward-rasterisation");
     assert_eq!(slug("3D-OVS"), "3d-ovs");
     assert_eq!(slug("Language beside a file: `NAME.language.npz`"), "language-beside-a-file-namelanguagenpz");
@@ -179,14 +178,14 @@ fn headings_become_the_anchors_that_github_makes() {
 
 #[test]
 fn citations_and_links_are_recognised() {
-    // In two pieces, or this line would be a citation itself.
+    // In two pieces, as this line would be a citation itself.
     let line =
         ["as docs/", "internals/method.md#code-length, step 1; docs/", "data.md has no anchor"].concat();
     assert_eq!(citations(&line), [("docs/internals/method.md".to_owned(), "code-length")]);
     assert_eq!(links("a [b](c.md#d), [e](#f) and [g] (h)"), ["c.md#d", "#f"]);
 }
 
-/// Headings of the troubleshooting page are pieces of sentences that the program prints.
+/// Headings of the troubleshooting page are parts of messages of the program.
 #[test]
 fn troubleshooting_has_sentences_of_the_program() {
     let page = std::fs::read_to_string(root().join("docs/use/troubleshooting.md")).unwrap();
@@ -200,7 +199,7 @@ fn troubleshooting_has_sentences_of_the_program() {
             sources.push_str(text);
         }
     }
-    // A literal may go on in the next line.
+    // A literal may continue in the next line.
     let sources = sources.replace("\\\n", "");
     let words: Vec<&str> = sources.split_whitespace().collect();
     let sources = words.join(" ");

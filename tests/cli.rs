@@ -1,5 +1,4 @@
-//! The program as a user runs it: what it refuses, how it says so, and that it leaves nothing
-//! half-written.
+//! The command line: refusals and their messages, and no half-written files.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
@@ -23,7 +22,7 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// `splatvk run INPUT... --out FOLDER/out/scene` must be refused, and FOLDER must stay empty.
+/// Expects that `splatvk run INPUT... --out FOLDER/out/scene` is refused and FOLDER stays empty.
 fn run_refuses(inputs: &[&Path], options: &[&str], words: &[&str]) {
     let folder = tempfile::tempdir().unwrap();
     let mut command = splatvk();
@@ -33,7 +32,7 @@ fn run_refuses(inputs: &[&Path], options: &[&str], words: &[&str]) {
 }
 
 #[test]
-fn photos_that_cannot_be_used() {
+fn unusable_photos_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let dir = folder.path();
     run_refuses(&[dir], &[], &["no photos"]);
@@ -61,7 +60,7 @@ fn photos_that_cannot_be_used() {
 }
 
 #[test]
-fn heic_without_its_library_says_what_to_do() {
+fn heic_without_library_explains_installation() {
     let folder = tempfile::tempdir().unwrap();
     let photo = |name: &str| data(name);
     let mut command = splatvk();
@@ -77,32 +76,33 @@ fn heic_without_its_library_says_what_to_do() {
 }
 
 #[test]
-fn doctor_compares_every_pass_on_the_device() {
+fn doctor_compares_all_passes() {
     let home = tempfile::tempdir().unwrap();
-    let check = |arguments: &[&str]| {
-        let output =
-            splatvk().arg("doctor").arg("--check").args(arguments).env("SPLATVK_HOME", home.path()).output();
-        let output = output.unwrap();
-        assert!(output.status.success(), "{}", text(&output.stderr));
-        text(&output.stdout)
-    };
-    let table = check(&[]);
+    let table = doctor_check(home.path(), &[]);
     assert!(
         table.lines().count() > 15 && table.lines().skip(1).all(|line| line.starts_with("ok ")),
         "{table}"
     );
-    let report: serde_json::Value = serde_json::from_str(&check(&["--json"])).unwrap();
+    let report: serde_json::Value = serde_json::from_str(&doctor_check(home.path(), &["--json"])).unwrap();
     assert_eq!(report["right"], true);
     assert_eq!(report["switched_off"], serde_json::json!([]));
     assert_eq!(report["passes"].as_array().unwrap().len(), table.lines().count() - 1);
+}
+
+/// Output of `splatvk doctor --check`.
+fn doctor_check(home: &Path, arguments: &[&str]) -> String {
+    let output = splatvk().arg("doctor").arg("--check").args(arguments).env("SPLATVK_HOME", home).output();
+    let output = output.unwrap();
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    text(&output.stdout)
 }
 
 #[test]
 fn photos_without_overlap_are_named() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::copy(data("breakfast/images/train_00.jpg"), folder.path().join("table.jpg")).unwrap();
-    // A few blocks of random colour: corners, none of them on the table, and few enough to be
-    // refused fast.
+    // A few blocks of random colour: corners, none of them on the table, and few enough for a quick
+    // refusal.
     let blob = |x: u32, y: u32, k: u32| ((x / 64 * 7919 + y / 48 * 104_729 + k * 31) % 251) as u8;
     let noise =
         image::RgbImage::from_fn(640, 480, |x, y| image::Rgb([blob(x, y, 0), blob(x, y, 1), blob(x, y, 5)]));
@@ -110,9 +110,9 @@ fn photos_without_overlap_are_named() {
     run_refuses(&[folder.path()], &[], &["overlap", "noise", "table"]);
 }
 
-/// With 4 MiB at once, 52 channels fit for 314 pixels side by side.
+/// With a limit of 4 MiB, 52 channels fit for 314 pixels side by side.
 #[test]
-fn a_size_that_cannot_be_done_is_refused_with_one_that_can() {
+fn impossible_size_error_suggests_possible_one() {
     let folder = tempfile::tempdir().unwrap();
     let mut command = splatvk();
     command.env("SPLATVK_MAX_BINDING", "4").arg("run").arg(data("breakfast/images"));
@@ -123,7 +123,7 @@ fn a_size_that_cannot_be_done_is_refused_with_one_that_can() {
     assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
 }
 
-/// A data set has more photos with cameras than are trained on.
+/// A data set has more photos with cameras than are used in training.
 #[test]
 fn train_chooses_views_and_names_them() {
     let folder = tempfile::tempdir().unwrap();
@@ -155,7 +155,7 @@ fn views_must_fit_the_photos() {
 }
 
 #[test]
-fn bad_usage_is_exit_code_two() {
+fn bad_usage_exits_with_two() {
     for args in [&["run"][..], &["frobnicate"], &["run", "x", "--views", "many"], &["render", "x"], &[]] {
         let output = splatvk().args(args).output().unwrap();
         assert_eq!(output.status.code(), Some(2), "{args:?}");
@@ -166,7 +166,7 @@ fn bad_usage_is_exit_code_two() {
 }
 
 #[test]
-fn what_was_meant_is_said_in_one_line() {
+fn misspelt_words_get_suggestions() {
     for (args, words) in [
         (&["rnu"][..], "there is no command rnu; did you mean run?"),
         (&["run", "x", "--quary", "lemon"], "there is no option --quary; did you mean --query?"),
@@ -178,11 +178,11 @@ fn what_was_meant_is_said_in_one_line() {
 
 #[cfg(target_os = "linux")]
 #[test]
-fn errors_of_the_system_are_words() {
+fn system_errors_are_explained() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
-    std::fs::write(at("file"), "x").unwrap();
-    std::os::unix::fs::symlink(at("loop"), at("loop")).unwrap();
+    let path_of = |name: &str| folder.path().join(name);
+    std::fs::write(path_of("file"), "x").unwrap();
+    std::os::unix::fs::symlink(path_of("loop"), path_of("loop")).unwrap();
     let long = "n".repeat(300);
     for (name, words) in [
         ("none", &["none: ", "does not exist"][..]),
@@ -192,33 +192,26 @@ fn errors_of_the_system_are_words() {
     ] {
         let words: Vec<&str> = words.iter().copied().chain(["; "]).collect();
         for line in [
-            refuses(splatvk().arg("view").arg(at(name)), 2, &[]),
-            refuses(splatvk().arg("run").arg(at(name)).arg("--out").arg(at("o")), 2, &words),
+            refuses(splatvk().arg("view").arg(path_of(name)), 2, &[]),
+            refuses(splatvk().arg("run").arg(path_of(name)).arg("--out").arg(path_of("o")), 2, &words),
         ] {
-            let said = text(&line.stderr);
-            assert!(!said.contains("os error"), "{said}");
+            let stderr = text(&line.stderr);
+            assert!(!stderr.contains("os error"), "{stderr}");
         }
     }
 }
 
 /// Without --out nothing is written: a row per text, or the same answers as JSON.
 #[test]
-fn a_question_without_a_folder_is_answered() {
+fn query_without_out_prints_answer() {
     let folder = tempfile::tempdir().unwrap();
     let scene = fixture::view::breakfast(folder.path());
     let empty = tempfile::tempdir().unwrap();
-    let ask = |more: &[&str]| {
-        let output =
-            splatvk().arg("query").arg(&scene).args(["lemon"]).args(more).current_dir(empty.path()).output();
-        let output = output.unwrap();
-        assert!(output.status.success(), "{}", text(&output.stderr));
-        text(&output.stdout)
-    };
-    let table = ask(&[]);
+    let table = ask(&scene, empty.path(), &[]);
     let lines: Vec<&str> = table.lines().collect();
     assert!(lines.len() == 2 && lines[0].starts_with("text ") && lines[0].ends_with("best view"), "{table}");
     assert!(lines[1].starts_with("“lemon”  found ") && lines[1].contains("train_0"), "{table}");
-    let report: serde_json::Value = serde_json::from_str(&ask(&["--json"])).unwrap();
+    let report: serde_json::Value = serde_json::from_str(&ask(&scene, empty.path(), &["--json"])).unwrap();
     let view = &report["queries"][0]["views"][0];
     assert!(report["out"].is_null() && view["found"] == true && view.get("heat").is_none(), "{report}");
     assert_eq!(names(empty.path()), [""; 0]);
@@ -227,7 +220,7 @@ fn a_question_without_a_folder_is_answered() {
     let long = "red ".repeat(50);
     let mut question = splatvk();
     refuses(question.arg("query").arg(&scene).arg(&long), 2, &["50 words", "at most 300 characters"]);
-    // Another record of the run would change how it answers: it is not taken for none.
+    // A damaged run.json is an error: without it the answers would differ.
     std::fs::write(scene.join("run.json"), "{\"config\"").unwrap();
     let mut damaged = splatvk();
     refuses(damaged.arg("query").arg(&scene).arg("lemon"), 2, &["run.json", "restore it"]);
@@ -241,8 +234,16 @@ fn a_question_without_a_folder_is_answered() {
     refuses(seen.arg("query").arg(&scene).arg("lemon"), 2, &["seen.npy", "a folder, not a file"]);
 }
 
+/// Output of a query about the lemon.
+fn ask(scene: &Path, current: &Path, more: &[&str]) -> String {
+    let output = splatvk().arg("query").arg(scene).args(["lemon"]).args(more).current_dir(current).output();
+    let output = output.unwrap();
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    text(&output.stdout)
+}
+
 #[test]
-fn output_that_cannot_be_written_is_found_before_the_work() {
+fn unwritable_output_fails_before_work() {
     let folder = tempfile::tempdir().unwrap();
     let photos = data("breakfast/images");
     let run = |out: PathBuf, words: &[&str]| {
@@ -268,7 +269,7 @@ fn output_that_cannot_be_written_is_found_before_the_work() {
 }
 
 #[test]
-fn missing_and_corrupt_models_are_named_with_their_checksum() {
+fn bad_model_error_names_checksum() {
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join("models");
     std::fs::create_dir(&models).unwrap();
@@ -293,21 +294,22 @@ fn missing_and_corrupt_models_are_named_with_their_checksum() {
 }
 
 #[test]
-fn no_vulkan_device_is_said_before_the_work() {
+fn missing_vulkan_device_fails_before_work() {
     let folder = tempfile::tempdir().unwrap();
-    let hidden = |c: &mut Command| {
-        c.env("VK_DRIVER_FILES", "/nonexistent.json").env("VK_ICD_FILENAMES", "/nonexistent.json");
-    };
     let mut run = splatvk();
-    hidden(&mut run);
+    hide_vulkan(&mut run);
     run.arg("run").arg(data("breakfast/images")).arg("--out").arg(folder.path().join("scene"));
     refuses(&mut run, 2, &["Vulkan", "mesa-vulkan-drivers"]);
     assert!(names(folder.path()).is_empty());
     let mut doctor = splatvk();
-    hidden(&mut doctor);
+    hide_vulkan(&mut doctor);
     let output = refuses(doctor.arg("doctor"), 2, &["missing"]);
     assert!(text(&output.stdout).contains("MISSING"), "{}", text(&output.stdout));
     run_refuses(&[&data("breakfast/images")], &["--device", "no such device"], &["no such device"]);
+}
+
+fn hide_vulkan(c: &mut Command) {
+    c.env("VK_DRIVER_FILES", "/nonexistent.json").env("VK_ICD_FILENAMES", "/nonexistent.json");
 }
 
 #[test]
@@ -326,24 +328,24 @@ fn ctrl_c_stops_cleanly() {
         assert!(start.elapsed() < Duration::from_secs(60), "the run never started");
         std::thread::sleep(Duration::from_millis(20));
     }
-    // Half a second into the work: reading photos is over, finding features is not.
+    // Half a second into the work: reading photos has finished, detecting features has not.
     std::thread::sleep(Duration::from_millis(500));
     let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
     assert!(killed.success());
-    // To its last line, with which everything is done: a busy kernel was seen to take 5 s more to
-    // take the process apart.
+    // Measured to the last line, after which the work is done: a busy kernel took 5 s more to tear
+    // down the process.
     let sent = Instant::now();
     let lines = BufReader::new(child.stderr.take().unwrap()).lines();
-    let said: Vec<(Duration, String)> = lines.map(|line| (sent.elapsed(), line.unwrap())).collect();
-    assert_eq!(child.wait().unwrap().code(), Some(130), "{said:?}");
-    let (took, last) = said.last().unwrap();
-    assert!(last.contains("nothing was written"), "{said:?}");
+    let messages: Vec<(Duration, String)> = lines.map(|line| (sent.elapsed(), line.unwrap())).collect();
+    assert_eq!(child.wait().unwrap().code(), Some(130), "{messages:?}");
+    let (took, last) = messages.last().unwrap();
+    assert!(last.contains("nothing was written"), "{messages:?}");
     assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
     assert!(*took < Duration::from_secs(2), "took {took:?} to stop");
 }
 
 #[test]
-fn a_full_disk_leaves_nothing() {
+fn full_disk_leaves_no_scene() {
     let folder = tempfile::tempdir().unwrap();
     let (images, cameras, points) = small_views();
     let mut export = splatvk();
@@ -372,35 +374,36 @@ fn a_full_disk_leaves_nothing() {
     assert!(names(folder.path()).is_empty(), "{:?}", names(folder.path()));
 }
 
-/// Every answer is held against the canonical phrases: without them, and without a network for
-/// them, nothing can be asked.
+/// Every answer is relative to the canonical phrases: without them, and without a network for them,
+/// no query is possible.
 #[test]
-fn text_embeddings_without_what_is_asked_are_refused_before_any_work() {
+fn missing_text_embedding_fails_before_work() {
     let folder = tempfile::tempdir().unwrap();
     let photos = data("breakfast/images");
     let dir = format!("dir:{}", folder.path().display());
     let options =
         |query: &'static str| ["--masks", &dir, "--features", &dir, "--query", query].map(str::to_owned);
-    let table = |phrases: &[&str]| {
-        let row = NpyArray::f32(&[3], vec![1.0, 0.0, 0.0]);
-        let rows: Vec<(&str, &NpyArray)> = phrases.iter().map(|p| (*p, &row)).collect();
-        npy::write_npz(folder.path().join("text_embeddings.npz"), &rows).unwrap();
-    };
-    let refused = |query: &'static str, words: &[&str]| {
+    let assert_refused = |query: &'static str, words: &[&str]| {
         let start = Instant::now();
         run_refuses(&[&photos], &options(query).each_ref().map(String::as_str), words);
         assert!(start.elapsed() < Duration::from_secs(5), "before any work");
     };
-    table(&["lemon"]);
-    refused("lemon", &["'object'", "text_embeddings.npz", "add the phrase"]);
-    table(&["lemon", "object", "things", "stuff"]);
-    refused("lemon", &["'texture'", "text_embeddings.npz"]);
-    table(&["lemon", "object", "things", "stuff", "texture"]);
-    refused("mug", &["'mug'", "text_embeddings.npz"]);
+    write_embeddings(folder.path(), &["lemon"]);
+    assert_refused("lemon", &["'object'", "text_embeddings.npz", "add the phrase"]);
+    write_embeddings(folder.path(), &["lemon", "object", "things", "stuff"]);
+    assert_refused("lemon", &["'texture'", "text_embeddings.npz"]);
+    write_embeddings(folder.path(), &["lemon", "object", "things", "stuff", "texture"]);
+    assert_refused("mug", &["'mug'", "text_embeddings.npz"]);
+}
+
+fn write_embeddings(folder: &Path, phrases: &[&str]) {
+    let row = NpyArray::f32(&[3], vec![1.0, 0.0, 0.0]);
+    let rows: Vec<(&str, &NpyArray)> = phrases.iter().map(|p| (*p, &row)).collect();
+    npy::write_npz(folder.join("text_embeddings.npz"), &rows).unwrap();
 }
 
 #[test]
-fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
+fn run_writes_complete_replaceable_scene() {
     let scene = scene();
     let expected =
         ["cameras", "point_cloud.ply", "previews", "report.html", "run.json", "scene.json", "seen.npy"];
@@ -408,12 +411,12 @@ fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
     let run: serde_json::Value =
         serde_json::from_slice(&std::fs::read(scene.join("run.json")).unwrap()).unwrap();
     assert!(run["stages"].as_array().unwrap().len() >= 2 && run["seed"] == 0 && run["device"].is_string());
-    let said = events(&std::fs::read_to_string(train_log()).unwrap());
+    let logged = events(&std::fs::read_to_string(train_log()).unwrap());
     let mut warned: Vec<_> =
-        said.iter().filter(|e| e["event"] == "warning").filter_map(|e| e["message"].as_str()).collect();
+        logged.iter().filter(|e| e["event"] == "warning").filter_map(|e| e["message"].as_str()).collect();
     let mut recorded: Vec<_> =
         run["warnings"].as_array().unwrap().iter().filter_map(|w| w.as_str()).collect();
-    // Two iterations show no photo well: the record says that before all else, though it is known
+    // Two iterations render no photo well: this warning is first in the record, though it occurs
     // last.
     assert!(recorded[0].starts_with("photos are reproduced at"), "{recorded:?}");
     warned.sort_unstable();
@@ -423,7 +426,7 @@ fn the_scene_of_a_run_is_whole_and_can_be_replaced() {
 }
 
 #[test]
-fn scenes_render_export_and_answer_only_what_they_know() {
+fn run_scene_renders_exports_and_answers() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("renders");
     let cameras = scene().join("cameras/transforms.json");
@@ -444,7 +447,7 @@ fn scenes_render_export_and_answer_only_what_they_know() {
     assert!(mean < 1e-3, "a photo shows what its own view shows: {mean}");
     let picture = image::open(out.join("train_00.png")).unwrap().to_rgb8();
     assert!(picture.dimensions() == (160, 120) && picture.pixels().any(|p| p.0[0] > 60));
-    // EXR holds linear light (IEC 61966-2-1), npy the values of the picture.
+    // EXR contains linear light (IEC 61966-2-1), npy the values of the picture.
     let light = splatvk::format::picture::read_exr(&out.join("train_00.exr")).unwrap();
     let shown = npy::read(out.join("train_00_rgb.npy")).unwrap().to_f32();
     for (red, v) in light["R"].data.iter().zip(shown.iter().step_by(3)).filter(|(_, v)| **v > 0.05) {
@@ -505,7 +508,7 @@ fn scenes_render_export_and_answer_only_what_they_know() {
 }
 
 #[test]
-fn a_closed_pipe_is_no_failure() {
+fn closed_pipe_exits_without_failure() {
     let mut child =
         splatvk().args(["models", "list"]).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     drop(child.stdout.take());
@@ -519,21 +522,21 @@ fn events(stderr: &str) -> Vec<serde_json::Value> {
 }
 
 #[test]
-fn logs_for_machines_are_one_json_object_per_line() {
+fn json_logs_have_object_per_line() {
     let record = scene().join("run.json");
     let events_of_training = events(&std::fs::read_to_string(train_log()).unwrap());
-    let of = |event: &str, stage: &str| -> Vec<&serde_json::Value> {
+    let events_of = |event: &str, stage: &str| -> Vec<&serde_json::Value> {
         events_of_training.iter().filter(|e| e["event"] == event && e["stage"] == stage).collect()
     };
-    assert_eq!((of("begin", "splats").len(), of("end", "splats").len()), (1, 1));
-    assert_eq!(of("begin", "splats")[0]["steps"], 20);
-    let figures = of("figures", "splats");
+    assert_eq!((events_of("begin", "splats").len(), events_of("end", "splats").len()), (1, 1));
+    assert_eq!(events_of("begin", "splats")[0]["steps"], 20);
+    let figures = events_of("figures", "splats");
     assert_eq!(figures.last().unwrap()["step"], 20);
     for f in &figures {
         let number = |name: &str| f[name].as_f64().unwrap();
         assert!(number("psnr") > 5.0 && number("loss") > 0.0 && number("splats") > 100.0, "{f}");
     }
-    // The report's curves are the same figures.
+    // The curves of the report are the same figures.
     let record: serde_json::Value = serde_json::from_slice(&std::fs::read(record).unwrap()).unwrap();
     let curves = record["statistics"]["curves"].as_array().unwrap();
     let psnr = curves.iter().find(|c| c["unit"] == "dB").unwrap()["points"].as_array().unwrap();

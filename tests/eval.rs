@@ -1,5 +1,5 @@
-//! `splatvk eval` on ground truth that is not what it should be, and stopped on the way: one line,
-//! and nothing written.
+//! `splatvk eval` with invalid ground truth, and when interrupted: a one-line error, and nothing
+//! written.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
@@ -11,7 +11,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// A copy of breakfast's ground truth, changed by `change`.
+/// A copy of the ground truth of breakfast, altered by `change`.
 fn copy(folder: &Path, change: impl FnOnce(&Path, &mut Value)) {
     for part in ["images", "held_out", "masks", "depth"] {
         std::fs::create_dir_all(folder.join(part)).unwrap();
@@ -33,50 +33,49 @@ fn eval(truth: &Path, out: &Path) -> Command {
 }
 
 #[test]
-fn ground_truth_that_does_not_fit_is_refused_before_anything_is_written() {
-    let refused = |words: &[&str], change: fn(&Path, &mut Value)| {
-        let folder = tempfile::tempdir().unwrap();
-        let out = folder.path().join("deep/out");
-        copy(&folder.path().join("truth"), change);
-        let output = eval(&folder.path().join("truth"), &out).output().unwrap();
-        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert_eq!(output.status.code(), Some(2), "{words:?}: {stderr}");
-        assert!(
-            stderr.lines().count() == 1 && words.iter().all(|w| stderr.contains(w)),
-            "{words:?}: {stderr}"
-        );
-        assert!(output.stdout.is_empty() && !folder.path().join("deep").exists(), "{words:?}");
-    };
-    refused(&["masks/train_01.png", "10 × 10", "640 × 480"], |folder, _| {
+fn eval_refuses_mismatched_ground_truth() {
+    assert_refused(&["masks/train_01.png", "10 × 10", "640 × 480"], |folder, _| {
         image::GrayImage::new(10, 10).save(folder.join("masks/train_01.png")).unwrap();
     });
-    refused(&["depth/test_05.npz", "5 × 5", "640 × 480"], |folder, _| {
+    assert_refused(&["depth/test_05.npz", "5 × 5", "640 × 480"], |folder, _| {
         let depth = NpyArray::f32(&[5, 5], vec![1.0; 25]);
         npy::write_npz(folder.join("depth/test_05.npz"), &[("depth", &depth)]).unwrap();
     });
-    refused(&["held_out/test_06.jpg", "32 × 24", "640 × 480"], |folder, _| {
+    assert_refused(&["held_out/test_06.jpg", "32 × 24", "640 × 480"], |folder, _| {
         image::RgbImage::new(32, 24).save(folder.join("held_out/test_06.jpg")).unwrap();
     });
-    refused(&["held_out/test_06.jpg"], |folder, _| {
+    assert_refused(&["held_out/test_06.jpg"], |folder, _| {
         std::fs::remove_file(folder.join("held_out/test_06.jpg")).unwrap();
     });
-    refused(&["ground_truth.json", "train_00", "focal lengths must be positive"], |_, text| {
+    assert_refused(&["ground_truth.json", "train_00", "focal lengths must be positive"], |_, text| {
         text["frames"][0]["fx"] = json!(0);
     });
-    refused(&["ground_truth.json", "train_00", "not a rotation"], |_, text| {
+    assert_refused(&["ground_truth.json", "train_00", "not a rotation"], |_, text| {
         text["frames"][0]["world_to_camera"] = json!(vec![[0.0; 4]; 4]);
     });
-    refused(&["ground_truth.json", "expected a sequence"], |_, text| {
+    assert_refused(&["ground_truth.json", "expected a sequence"], |_, text| {
         text["frames"] = json!("none");
     });
-    refused(&["truth", "0 of its train frames"], |_, text| {
+    assert_refused(&["truth", "0 of its train frames"], |_, text| {
         text["frames"].as_array_mut().unwrap().retain(|f| f["split"] == "test");
     });
 }
 
-/// A scene with language is scored by its masks; one without needs none.
+/// Expects that `eval` refuses a changed ground truth, and that it writes nothing.
+fn assert_refused(words: &[&str], change: fn(&Path, &mut Value)) {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("deep/out");
+    copy(&folder.path().join("truth"), change);
+    let output = eval(&folder.path().join("truth"), &out).output().unwrap();
+    let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{words:?}: {stderr}");
+    assert!(stderr.lines().count() == 1 && words.iter().all(|w| stderr.contains(w)), "{words:?}: {stderr}");
+    assert!(output.stdout.is_empty() && !folder.path().join("deep").exists(), "{words:?}");
+}
+
+/// A scene with language needs masks for its score; one without needs none.
 #[test]
-fn masks_that_are_missing_are_said_where_they_are_needed() {
+fn eval_names_missing_masks() {
     let folder = tempfile::tempdir().unwrap();
     copy(folder.path(), |folder, _| std::fs::remove_file(folder.join("masks/test_07.png")).unwrap());
     let read = GroundTruth::read(folder.path()).unwrap();
@@ -94,20 +93,20 @@ fn masks_that_are_missing_are_said_where_they_are_needed() {
     assert_eq!(GroundTruth::read(&data("breakfast")).unwrap().check(true).unwrap(), None);
 }
 
-/// Whether a folder or one below it has an entry of that name.
+/// Whether a folder or one below it has an entry of a name.
 fn holds(folder: &Path, name: &str) -> bool {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     entries.map(|e| e.path()).any(|p| p.ends_with(name) || p.is_dir() && holds(&p, name))
 }
 
 #[test]
-fn stopped_it_leaves_nothing_and_finished_it_leaves_all() {
+fn eval_writes_all_or_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("deep/out");
     let mut child =
         eval(&data("breakfast"), &out).stderr(Stdio::piped()).stdout(Stdio::null()).spawn().unwrap();
     let begun = Instant::now();
-    // The first picture is written.
+    // The first picture has been written.
     let hidden = folder.path().join("deep/.out.partial-splatvk");
     while !holds(&hidden, "renders") {
         assert!(begun.elapsed() < Duration::from_secs(60) && child.try_wait().unwrap().is_none());

@@ -1,5 +1,4 @@
-//! glTF files: what is written reads back, and what is not a readable file of Gaussians is refused
-//! in one line.
+//! glTF files: round trips, and one-line errors for unreadable files.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::indexing_slicing)] // a panic is how a test fails
 use serde_json::{Value, json};
 use splatvk::format::gaussians;
@@ -32,7 +31,7 @@ fn close(a: &[f32], b: &[f32], bound: f32, what: &str) {
 }
 
 #[test]
-fn both_kinds_round_trip() {
+fn gltf_and_glb_round_trip() {
     let folder = tempfile::tempdir().unwrap();
     for degree in 0..=3 {
         let s = splats(9, degree);
@@ -53,8 +52,8 @@ fn both_kinds_round_trip() {
     }
 }
 
-/// A text file of three Gaussians, changed by `change`, and what reading it says.
-fn refused(folder: &Path, change: impl FnOnce(&mut Value)) -> String {
+/// Error of a text file of three Gaussians, altered by `change`.
+fn refusal(folder: &Path, change: impl FnOnce(&mut Value)) -> String {
     let path = folder.join("b.gltf");
     gaussians::write(&path, &splats(3, 1), None).unwrap();
     let mut root: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
@@ -66,26 +65,26 @@ fn refused(folder: &Path, change: impl FnOnce(&mut Value)) -> String {
 }
 
 #[test]
-fn unreadable_files_are_refused() {
+fn gltf_refuses_unreadable_files() {
     let folder = tempfile::tempdir().unwrap();
-    let said = |change: fn(&mut Value), words: &str| {
-        let text = refused(folder.path(), change);
+    let assert_refusal = |change: fn(&mut Value), words: &str| {
+        let text = refusal(folder.path(), change);
         assert!(text.contains(words), "{text}: says nothing of {words}");
     };
-    said(|r| r["meshes"][0]["primitives"][0]["extensions"] = json!({}), "not a file of Gaussians");
-    said(|r| r["meshes"][0]["primitives"][0]["mode"] = json!(4), "mode 0");
-    said(
+    assert_refusal(|r| r["meshes"][0]["primitives"][0]["extensions"] = json!({}), "not a file of Gaussians");
+    assert_refusal(|r| r["meshes"][0]["primitives"][0]["mode"] = json!(4), "mode 0");
+    assert_refusal(
         |r| r["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["kernel"] = json!("disc"),
         "kernel disc",
     );
-    said(
+    assert_refusal(
         |r| {
             r["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["colorSpace"] =
                 json!("lin_rec709_display");
         },
         "colorSpace lin_rec709_display",
     );
-    said(
+    assert_refusal(
         |r| {
             let attributes = r["meshes"][0]["primitives"][0]["attributes"].as_object_mut().unwrap();
             attributes.remove("KHR_gaussian_splatting:SH_DEGREE_1_COEF_0");
@@ -95,47 +94,50 @@ fn unreadable_files_are_refused() {
     for name in
         ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_gaussian_splatting_compression_spz_2"]
     {
-        let text = refused(folder.path(), |r| r["extensionsRequired"] = json!([name]));
+        let text = refusal(folder.path(), |r| r["extensionsRequired"] = json!([name]));
         assert!(text.contains(name) && text.contains("without compression"), "{text}");
     }
-    said(
+    assert_refusal(
         |r| r["extensionsRequired"] = json!(["EXT_unheard_of"]),
         "EXT_unheard_of, which splatvk does not know",
     );
-    said(|r| r["nodes"][0]["extensions"] = json!({ "EXT_mesh_gpu_instancing": {} }), "as a node of its own");
-    said(
+    assert_refusal(
+        |r| r["nodes"][0]["extensions"] = json!({ "EXT_mesh_gpu_instancing": {} }),
+        "as a node of its own",
+    );
+    assert_refusal(
         |r| r["bufferViews"][0]["extensions"] = json!({ "KHR_meshopt_compression": {} }),
         "KHR_meshopt_compression",
     );
-    said(
+    assert_refusal(
         |r| {
             r["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["extensions"] =
                 json!({ "KHR_gaussian_splatting_compression_spz_2": {} });
         },
         "KHR_gaussian_splatting_compression_spz_2",
     );
-    said(
+    assert_refusal(
         |r| r["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["kernel"] = json!(7),
         "kernel 7 is not supported",
     );
-    said(|r| r["nodes"][0]["scale"] = json!([1, 2, 1]), "stretches or mirrors");
-    said(|r| r["nodes"][0]["scale"] = json!([1, 1, -1]), "stretches or mirrors");
-    said(|r| r["nodes"][0]["children"] = json!([0]), "form a tree");
-    said(|r| r["scenes"][0]["nodes"] = json!([7]), "no node 7");
-    said(|r| r["nodes"][0]["mesh"] = json!(3), "no mesh 3");
-    said(|r| r["accessors"][1]["count"] = json!(2), "different numbers");
-    said(|r| r["accessors"][1]["count"] = json!(u64::MAX / 8), "ends early");
-    said(|r| r["accessors"][1]["componentType"] = json!(5125), "unknown type");
-    said(|r| r["accessors"][1]["type"] = json!("VEC2"), "VEC4 is needed");
-    said(|r| r["accessors"][1]["sparse"] = json!({}), "sparse");
-    said(|r| r["bufferViews"][2]["byteLength"] = json!(8), "ends early");
-    said(|r| r["bufferViews"][2]["byteStride"] = json!(4), "ends early");
-    said(|r| r["buffers"][0]["uri"] = json!("missing.bin"), "missing.bin");
-    said(|r| r["buffers"][0]["uri"] = json!("https://example.org/a.bin"), "not a local file");
-    said(|r| r["buffers"][0]["uri"] = json!("data:;base64,!"), "base64");
+    assert_refusal(|r| r["nodes"][0]["scale"] = json!([1, 2, 1]), "stretches or mirrors");
+    assert_refusal(|r| r["nodes"][0]["scale"] = json!([1, 1, -1]), "stretches or mirrors");
+    assert_refusal(|r| r["nodes"][0]["children"] = json!([0]), "form a tree");
+    assert_refusal(|r| r["scenes"][0]["nodes"] = json!([7]), "no node 7");
+    assert_refusal(|r| r["nodes"][0]["mesh"] = json!(3), "no mesh 3");
+    assert_refusal(|r| r["accessors"][1]["count"] = json!(2), "different numbers");
+    assert_refusal(|r| r["accessors"][1]["count"] = json!(u64::MAX / 8), "ends early");
+    assert_refusal(|r| r["accessors"][1]["componentType"] = json!(5125), "unknown type");
+    assert_refusal(|r| r["accessors"][1]["type"] = json!("VEC2"), "VEC4 is needed");
+    assert_refusal(|r| r["accessors"][1]["sparse"] = json!({}), "sparse");
+    assert_refusal(|r| r["bufferViews"][2]["byteLength"] = json!(8), "ends early");
+    assert_refusal(|r| r["bufferViews"][2]["byteStride"] = json!(4), "ends early");
+    assert_refusal(|r| r["buffers"][0]["uri"] = json!("missing.bin"), "missing.bin");
+    assert_refusal(|r| r["buffers"][0]["uri"] = json!("https://example.org/a.bin"), "not a local file");
+    assert_refusal(|r| r["buffers"][0]["uri"] = json!("data:;base64,!"), "base64");
     // Scales of the drafts were logarithms: here the accessor of SCALE is that of the means, some
     // of them negative.
-    said(
+    assert_refusal(
         |r| {
             let attributes = r["meshes"][0]["primitives"][0]["attributes"].as_object_mut().unwrap();
             attributes["KHR_gaussian_splatting:SCALE"] = attributes["POSITION"].clone();
@@ -145,7 +147,7 @@ fn unreadable_files_are_refused() {
 }
 
 #[test]
-fn extensions_that_change_nothing_are_read() {
+fn gltf_reads_harmless_extensions() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.gltf");
     let s = splats(3, 1);
@@ -177,7 +179,7 @@ fn extensions_that_change_nothing_are_read() {
 
 /// Right, up and back in the file; right, down and forward in a scene.
 #[test]
-fn gaussians_are_in_the_axes_of_gltf_and_where_all_nodes_above_them_put_them() {
+fn gltf_applies_all_parent_transforms() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("nodes.gltf");
     let s = Splats { means: vec![[1.0, -2.0, -3.0]], ..splats(1, 0) };
@@ -196,10 +198,10 @@ fn gaussians_are_in_the_axes_of_gltf_and_where_all_nodes_above_them_put_them() {
     close(&back.log_scales[0], &s.log_scales[0].map(|v| v + 2f32.ln()), 1e-5, "log scales");
 }
 
-/// Of as many nodes as are read, without scenes, every node that no other has is one: looking for
-/// that of each in all others took half a minute.
+/// As many nodes as are read, without scenes, so that every node without a parent is a root:
+/// searching for each in all others took half a minute.
 #[test]
-fn many_nodes_are_read_at_once() {
+fn gltf_reads_many_nodes() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("many.gltf");
     gaussians::write(&path, &splats(3, 0), None).unwrap();
@@ -220,7 +222,7 @@ fn many_nodes_are_read_at_once() {
 }
 
 #[test]
-fn cut_files_are_refused() {
+fn gltf_refuses_truncated_files() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.glb");
     gaussians::write(&path, &splats(3, 0), None).unwrap();

@@ -1,17 +1,17 @@
-//! Gradients of the whole render on the GPU against the f64 reference, which is itself checked by
-//! central differences.
+//! Gradients of the whole render on the GPU compared with the f64 reference, which itself is
+//! checked by central differences.
 mod support;
 use splatvk::gpu::{self, NATIVE_FLOAT_ATOMICS, Options, Recorder, TestDevice, test_device};
 use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction};
 use splatvk::scene::seeded;
 use support::{GpuGradients, Scene, assert_class, assert_gradients};
 
-/// Added up by atomics and entry by entry; the latter gives the same bits every time.
+/// Reduced by atomics and by entries; the latter is bit-reproducible.
 #[test]
 fn random_scenes_match_reference() {
     let device = test_device();
-    let by = |summation| DeviceChoices { summation, ..DeviceChoices::of(&device) };
-    let (atomics, entries) = (by(GradientReduction::Atomics), by(GradientReduction::Entries));
+    let choices = |summation| DeviceChoices { summation, ..DeviceChoices::of(&device) };
+    let (atomics, entries) = (choices(GradientReduction::Atomics), choices(GradientReduction::Entries));
     for (n, sh_degree, dim) in [(1, 3, 3), (10, 3, 0), (100, 2, 8), (500, 1, 16), (100, 0, 48)] {
         let scene = Scene::small(n, sh_degree, dim, 60 + n as u64);
         println!("{n} splats, degree {sh_degree}, {dim} features");
@@ -23,7 +23,7 @@ fn random_scenes_match_reference() {
     }
 }
 
-/// Opacities that fall where the projection dilates a splat, and those that no longer reach a
+/// Opacities that fall where the projection dilates a splat, and splats that no longer reach a
 /// pixel.
 #[test]
 fn antialiased_scenes_match_reference() {
@@ -33,7 +33,7 @@ fn antialiased_scenes_match_reference() {
         let upstream = scene.upstream(7);
         let plain = scene.gradients(&device, &upstream);
         scene.splats.antialiased = true;
-        // A needle of a thousandth of a pixel, and a splat of no extent along the third axis.
+        // A needle of a thousandth of a pixel, and a splat without extent along the third axis.
         scene.splats.log_scales[0] = [-1.0, -9.0, -9.0];
         scene.splats.log_scales[n / 2][2] = f32::MIN_POSITIVE.ln();
         let gradients = scene.gradients(&device, &upstream);
@@ -42,9 +42,9 @@ fn antialiased_scenes_match_reference() {
     }
 }
 
-/// More splats than the way back through the projection has threads on a CPU device.
+/// More splats than the backward pass of the projection has threads on a CPU device.
 #[test]
-fn every_one_of_thousands_of_splats_gets_its_gradient() {
+fn all_of_many_splats_get_gradients() {
     let device = test_device();
     let n = 64 * 64 + 900;
     let (splats, camera) = seeded::benchmark(n, 40, 24, 0, 68);
@@ -52,9 +52,9 @@ fn every_one_of_thousands_of_splats_gets_its_gradient() {
     assert_gradients(&scene, &scene.gradients(&device, &scene.upstream(11)), 11);
 }
 
-/// A step with short lists first, for which the buffers of its entries are made.
+/// A step with short lists first, which determines the size of the entry buffers.
 #[test]
-fn gradients_by_entry_have_room_for_lists_that_have_grown() {
+fn entry_gradients_fit_grown_lists() {
     let device = test_device();
     let ways = DeviceChoices { summation: GradientReduction::Entries, ..DeviceChoices::of(&device) };
     let mut scene = Scene::small(12, 0, 3, 67);
@@ -78,10 +78,9 @@ fn gradients_by_entry_have_room_for_lists_that_have_grown() {
     assert_eq!(grown, scene.gradients_by(&device, ways, &upstream));
 }
 
-/// With an upstream that is alike everywhere, means move mostly by the direction from which colours
-/// are seen.
+/// With the same upstream everywhere, the means move mostly by the view dependence of colours.
 #[test]
-fn colours_that_change_with_the_direction_move_the_means_as_in_the_twin() {
+fn view_dependent_colours_match_reference() {
     let device = test_device();
     let mut scene = Scene::small(15, 3, 0, 70);
     scene.splats.sh.fill(0.3);
@@ -90,14 +89,14 @@ fn colours_that_change_with_the_direction_move_the_means_as_in_the_twin() {
     let pixels = scene.pixels();
     let mut upstream = vec![0.0; 5 * pixels];
     upstream[..3 * pixels].fill(1.0);
-    let reference = scene.twin_gradients(&scene.reference(), &upstream).params.means;
+    let reference = scene.reference_gradients(&scene.reference(), &upstream).params.means;
     let reference: Vec<f64> = reference.iter().flat_map(|m| m.to_array()).collect();
     let gradients = scene.gradients(&device, &upstream);
     assert_class("means", gradients.splats.means.as_flattened(), &reference);
 }
 
-/// Edge cases of docs/internals/method.md#tolerances: clamped α, clamped Jacobian, needle, behind,
-/// hidden, outside, a clamped colour.
+/// Edge cases of docs/internals/method.md#tolerances: clamped α, clamped Jacobian, needle, behind
+/// the camera, transparent, outside, a clamped colour.
 #[test]
 fn edge_cases_match_reference() {
     let device = test_device();
@@ -126,10 +125,10 @@ fn edge_cases_match_reference() {
     assert_eq!(gradients.splats.sh[7 * 48], 0.0);
 }
 
-/// Linear features, and features at exactly zero in the gauge, where the Jacobian is 1/ε; one
-/// gauge, and one per level.
+/// Linear features, and features of exactly zero in the gauge, where the Jacobian is 1/ε; with one
+/// gauge, and with one per level.
 #[test]
-fn both_feature_modes_match_reference() {
+fn feature_modes_match_reference() {
     let device = test_device();
     let mut scene = Scene::small(40, 0, 6, 5);
     scene.features[6..12].fill(0.0);
@@ -141,9 +140,9 @@ fn both_feature_modes_match_reference() {
     }
 }
 
-/// Without coupling, the features' part of the loss moves the features alone.
+/// Without coupling, the loss of the features changes only the features.
 #[test]
-fn detached_features_do_not_move_the_geometry() {
+fn detached_features_leave_geometry_unchanged() {
     let device = test_device();
     for dim in [3, 24] {
         let mut scene = Scene::small(50, 0, dim, 9);
@@ -167,9 +166,9 @@ fn detached_features_do_not_move_the_geometry() {
     }
 }
 
-/// The compare-and-swap side of gpu/atomic_float.glsl gives the same sums.
+/// The compare-and-swap path of gpu/atomic_float.glsl computes the same sums.
 #[test]
-fn without_float_atomics_the_gradients_are_the_same() {
+fn gradients_match_without_float_atomics() {
     let device = TestDevice::open(&Options {
         disabled: [NATIVE_FLOAT_ATOMICS.to_owned()].into(),
         ..gpu::options(None)
@@ -182,7 +181,8 @@ fn without_float_atomics_the_gradients_are_the_same() {
     assert_gradients(&scene, &scene.gradients_by(&device, ways, &upstream), 14);
 }
 
-/// Scene and camera moved together change nothing: Σ ∂μ = Rᵀ ∂ρ, here over a whole GPU scene.
+/// A common translation of scene and camera changes nothing: Σ ∂μ = Rᵀ ∂ρ, here over a whole GPU
+/// scene.
 #[test]
 fn common_translation_is_a_gauge() {
     let device = test_device();
@@ -194,10 +194,9 @@ fn common_translation_is_a_gauge() {
     assert_class("translation", &moved, &rho);
 }
 
-/// Widths that leave room in the last launch: in the sums by entry nothing may reach the next
-/// splat.
+/// Widths that leave the last launch partly unused: sums by entry must not reach the next splat.
 #[test]
-fn feature_widths_that_fill_no_launch_match_reference() {
+fn partial_launch_widths_match_reference() {
     let device = test_device();
     for dim in [4, 10, 24, 37] {
         let scene = Scene::small(30, 0, dim, 90 + dim as u64);

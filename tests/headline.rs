@@ -1,5 +1,5 @@
-//! The headline figures of one small run, from photos to scored answers through the command line: a
-//! stage that breaks shows here even if it still runs.
+//! The headline figures of one small run, from photos to scored answers through the command line:
+//! detects a stage that still runs but has become worse.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 mod fixture;
 
@@ -7,7 +7,7 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Held-out frames that are scored: one between the photos, one at the side.
+/// Held-out frames that are scored: one between the photos, one beside them.
 const HELD_OUT: [&str; 2] = ["test_05", "test_08"];
 
 fn splatvk(args: &[&str]) -> Vec<u8> {
@@ -16,8 +16,8 @@ fn splatvk(args: &[&str]) -> Vec<u8> {
     output.stdout
 }
 
-/// The photos at half size, where the whole pipeline takes seconds, and the truth of the frames to
-/// score.
+/// Writes the photos at half size, at which the whole pipeline takes seconds, and the ground truth
+/// of the frames to score.
 fn prepare(folder: &Path) -> (PathBuf, PathBuf) {
     let (photos, truth) = (folder.join("photos"), folder.join("truth"));
     fixture::truth_of(&truth, |file| {
@@ -35,7 +35,7 @@ fn prepare(folder: &Path) -> (PathBuf, PathBuf) {
 }
 
 #[test]
-fn a_small_run_reaches_its_figures() {
+fn small_run_reaches_headline_figures() {
     let folder = tempfile::tempdir().unwrap();
     let (photos, truth) = prepare(folder.path());
     let (scene, out) = (folder.path().join("scene"), folder.path().join("eval"));
@@ -44,13 +44,13 @@ fn a_small_run_reaches_its_figures() {
     splatvk(&[&["run", photos, "--out", scene, "--query", "lemon", "--json"], &short[..]].concat());
     let record = std::fs::read(Path::new(scene).join("run.json")).unwrap();
     let record: Value = serde_json::from_slice(&record).unwrap();
-    // Four photos would do for trials, but they show the same points equally bright.
+    // Four photos suffice for trials, but they show the same points equally bright.
     let trials = record["statistics"]["view_dependence"]["trials"].as_array().unwrap();
     assert!(trials.is_empty(), "trials of SH degrees without highlights: {trials:?}");
     let report = splatvk(&["eval", scene, "--ground-truth", truth, "--out", out, "--json"]);
     let report: Value = serde_json::from_slice(&report).unwrap();
     let (train, test) = (&report["summary"]["train"], &report["summary"]["test"]);
-    let figure = |of: &Value, name: &str| of[name].as_f64().unwrap();
+    let figure = |part: &Value, name: &str| part[name].as_f64().unwrap();
     let worst = |name: &str| {
         let poses = report["poses"].as_array().unwrap();
         poses.iter().map(|p| p[name].as_f64().unwrap()).fold(0.0, f64::max)
@@ -72,8 +72,9 @@ fn a_small_run_reaches_its_figures() {
         lemon("test"),
     );
     // Measured: 0.061 degrees, 0.054 %, 0.08 %, 0.968; depth 0.48 % and 0.47 %; 30.3 and 28.3 dB;
-    // localised 0.97, mIoU 0.63. Float atomics, drivers and seeds move these by a few percent, mIoU
-    // from 0.62 to 0.77 (seeds 0 to 2), and may cost one answer; a broken stage costs far more.
+    // localised 0.97, mIoU 0.63. Float atomics, drivers and seeds change these by a few percent,
+    // mIoU from 0.62 to 0.77 (seeds 0 to 2), and may cost one answer; a broken stage costs far
+    // more.
     assert!(worst("rotation_degrees") < 0.15, "rotation");
     assert!(worst("centre_fraction") < 0.0015, "centre");
     assert!(worst("focal_relative") < 0.004, "focal");

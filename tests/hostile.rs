@@ -1,5 +1,5 @@
-//! Files that somebody else made, as the program meets them: one clear line, exit code 2, nothing
-//! half-written.
+//! Damaged and hostile input files: the program prints one clear line, exits with code 2, and
+//! leaves no partial output.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
@@ -13,7 +13,7 @@ fn splatvk(arguments: &[&str]) -> Output {
     c.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).args(arguments).output().unwrap()
 }
 
-/// Must end with `code` and one error line of bounded length without control characters, which
+/// Expects exit code `code` and one error line of bounded length without control characters that
 /// contains the words.
 fn refuses(code: i32, arguments: &[&str], words: &[&str]) {
     let output = splatvk(arguments);
@@ -53,8 +53,12 @@ fn field(n: usize) -> LanguageField {
     LanguageField { levels: vec![level, LevelField::default(), LevelField::default()], space: "x".into() }
 }
 
-/// Puts a number in the place of one of a binary PLY of degree 0.
-fn poison(path: &Path, row: usize, column: usize, value: f32) {
+fn text_path(folder: &Path, name: &str) -> String {
+    folder.join(name).to_string_lossy().into_owned()
+}
+
+/// Overwrites one number of a binary PLY of degree 0.
+fn overwrite(path: &Path, row: usize, column: usize, value: f32) {
     let mut bytes = std::fs::read(path).unwrap();
     let body = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
     let width = (bytes.len() - body) / 50;
@@ -63,61 +67,63 @@ fn poison(path: &Path, row: usize, column: usize, value: f32) {
 }
 
 #[test]
-fn camera_files_are_checked_when_they_are_read() {
+fn camera_files_are_validated_on_read() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
-    gaussians::write(at("a.ply").as_ref(), &splats(3), None).unwrap();
-    let frame = |name: &str, w: f64| {
-        serde_json::json!({ "fl_x": 50, "w": w, "h": 48, "frames": [{
-            "file_path": name, "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-        }] })
-        .to_string()
-    };
-    let (out, scene) = (at("out"), at("a.ply"));
-    let refused = |cameras: &str, words: &[&str]| {
+    let path_of = |name: &str| text_path(folder.path(), name);
+    gaussians::write(path_of("a.ply").as_ref(), &splats(3), None).unwrap();
+    let (out, scene) = (path_of("out"), path_of("a.ply"));
+    let assert_refused = |cameras: &str, words: &[&str]| {
         refuses(2, &["render", &scene, "--cameras", cameras, "--out", &out], words);
         assert!(!Path::new(&out).exists(), "{cameras} left something behind");
     };
     for (text, words) in [
-        (frame("a", 1e6), "1000000 × 48 pixels are too many"),
-        (frame("a\0b", 64.0), "a control character is in its name"),
-        (frame("\u{1b}[31mred\n\u{7}", 64.0), "a control character is in its name"),
-        (frame(&"x".repeat(300), 64.0), "too long"),
-        (frame(&"x".repeat(5_000_000), 64.0), "too long"),
-        (frame("a", 64.0).replace("50", "null"), "no focal length"),
+        (transforms("a", 1e6), "1000000 × 48 pixels are too many"),
+        (transforms("a\0b", 64.0), "a control character is in its name"),
+        (transforms("\u{1b}[31mred\n\u{7}", 64.0), "a control character is in its name"),
+        (transforms(&"x".repeat(300), 64.0), "too long"),
+        (transforms(&"x".repeat(5_000_000), 64.0), "too long"),
+        (transforms("a", 64.0).replace("50", "null"), "no focal length"),
         ("{\"frames\": 3}".to_owned(), "not a JSON camera file (transforms.json)"),
         ("hello".to_owned(), "not a JSON camera file"),
     ] {
-        std::fs::write(at("c.json"), text).unwrap();
-        refused(&at("c.json"), &["c.json", words]);
+        std::fs::write(path_of("c.json"), text).unwrap();
+        assert_refused(&path_of("c.json"), &["c.json", words]);
     }
-    std::fs::create_dir(at("folder.json")).unwrap();
-    refused(&at("folder.json"), &["no cameras here"]);
-    refused(&at("none.json"), &["none.json", "check the name"]);
+    std::fs::create_dir(path_of("folder.json")).unwrap();
+    assert_refused(&path_of("folder.json"), &["no cameras here"]);
+    assert_refused(&path_of("none.json"), &["none.json", "check the name"]);
     #[cfg(target_os = "linux")]
     {
         use std::os::unix::fs::symlink;
-        symlink("/dev/zero", at("zero.json")).unwrap();
-        symlink(at("loop.json"), at("loop.json")).unwrap();
-        refused("/dev/zero", &["is a device or pipe"]);
-        refused(&at("zero.json"), &["zero.json", "is a device or pipe"]);
-        refused(&at("loop.json"), &["loop.json", "check the name"]);
+        symlink("/dev/zero", path_of("zero.json")).unwrap();
+        symlink(path_of("loop.json"), path_of("loop.json")).unwrap();
+        assert_refused("/dev/zero", &["is a device or pipe"]);
+        assert_refused(&path_of("zero.json"), &["zero.json", "is a device or pipe"]);
+        assert_refused(&path_of("loop.json"), &["loop.json", "check the name"]);
     }
 }
 
+/// transforms.json with one frame.
+fn transforms(name: &str, w: f64) -> String {
+    serde_json::json!({ "fl_x": 50, "w": w, "h": 48, "frames": [{
+        "file_path": name, "transform_matrix": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    }] })
+    .to_string()
+}
+
 #[test]
-fn gaussians_that_are_not_finite_are_left_out_and_counted() {
+fn export_omits_nonfinite_gaussians() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let path_of = |name: &str| text_path(folder.path(), name);
     for (k, (column, value)) in [(0, f32::INFINITY), (9, f32::NAN), (10, 100.0)].into_iter().enumerate() {
         // Columns: x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0.
-        let path = at(&format!("a{k}.ply"));
+        let path = path_of(&format!("a{k}.ply"));
         let options = ply::PlyOptions { degree: 0, language: None };
         ply::write_splats(path.as_ref(), &splats(50), options).unwrap();
-        poison(path.as_ref(), 7, column, value);
+        overwrite(path.as_ref(), 7, column, value);
         for format in ["glb", "gltf", "splat", "compressed-ply", "spz", "ply"] {
             let ending = format.replace("compressed-ply", "compressed.ply");
-            let out = at(&format!("out{k}.{ending}"));
+            let out = path_of(&format!("out{k}.{ending}"));
             let output = splatvk(&["export", &path, "--format", format, "--out", &out]);
             let stderr = String::from_utf8_lossy(&output.stderr);
             assert!(output.status.success(), "{stderr}");
@@ -130,10 +136,10 @@ fn gaussians_that_are_not_finite_are_left_out_and_counted() {
 }
 
 #[test]
-fn names_of_another_format_are_refused() {
+fn export_refuses_mismatched_file_name() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
-    gaussians::write(at("a.ply").as_ref(), &splats(3), None).unwrap();
+    let path_of = |name: &str| text_path(folder.path(), name);
+    gaussians::write(path_of("a.ply").as_ref(), &splats(3), None).unwrap();
     for (format, out, words) in [
         ("spz", "tree.ply", ["not spz", "tree.spz", "--format ply"]),
         ("ply", "tree.compressed.ply", ["tree.ply", "--format compressed-ply", ".compressed.ply"]),
@@ -142,17 +148,17 @@ fn names_of_another_format_are_refused() {
         ("ply", "tree.json", ["tree.ply", "--format transforms", ".json"]),
         ("spz", "..ply", ["..spz", "--format ply", ".ply"]),
     ] {
-        refuses(2, &["export", &at("a.ply"), "--format", format, "--out", &at(out)], &words);
+        refuses(2, &["export", &path_of("a.ply"), "--format", format, "--out", &path_of(out)], &words);
         assert!(!folder.path().join(out).exists());
     }
-    // A name of no format is written, with a warning; those of COLMAP are folders.
+    // A name of no format is accepted with a warning; COLMAP models are folders.
     for (format, out, warned) in [
         ("ply", "tree", true),
         ("spz", "tree.xyz", true),
         ("compressed-ply", "b.ply", false),
         ("spz", "t.v2.spz", false),
     ] {
-        let output = splatvk(&["export", &at("a.ply"), "--format", format, "--out", &at(out)]);
+        let output = splatvk(&["export", &path_of("a.ply"), "--format", format, "--out", &path_of(out)]);
         let stderr = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success() && folder.path().join(out).is_file(), "{stderr}");
         assert_eq!(
@@ -161,40 +167,44 @@ fn names_of_another_format_are_refused() {
             "{stderr}"
         );
     }
-    // Without a format, the ending of the file decides.
+    // Without a format, the extension of the file decides.
     for out in ["c.compressed.ply", "c.spz", "c.GLB"] {
-        let output = splatvk(&["export", &at("a.ply"), "--out", &at(out)]);
+        let output = splatvk(&["export", &path_of("a.ply"), "--out", &path_of(out)]);
         assert!(output.status.success() && output.stderr.is_empty(), "{output:?}");
-        assert_eq!(gaussians::read(at(out).as_ref()).unwrap().0.len(), 3);
+        assert_eq!(gaussians::read(path_of(out).as_ref()).unwrap().0.len(), 3);
     }
-    refuses(2, &["export", &at("a.ply"), "--out", &at("c.obj")], &["no format", "--format", ".spz", ".json"]);
+    refuses(
+        2,
+        &["export", &path_of("a.ply"), "--out", &path_of("c.obj")],
+        &["no format", "--format", ".spz", ".json"],
+    );
 }
 
 #[test]
-fn scenes_beyond_spz_are_refused_by_name() {
+fn spz_limits_refuse_unsuitable_scenes() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let path_of = |name: &str| text_path(folder.path(), name);
     let mut far = splats(3);
     far.means[1][2] = 2e7;
-    gaussians::write(at("a.ply").as_ref(), &far, None).unwrap();
+    gaussians::write(path_of("a.ply").as_ref(), &far, None).unwrap();
     let words = ["b.spz: the scene reaches 2.0e7", "--only-seen", "--format ply"];
-    let line = ["export", &at("a.ply"), "--format", "spz", "--out", &at("b.spz")];
+    let line = ["export", &path_of("a.ply"), "--format", "spz", "--out", &path_of("b.spz")];
     refuses(2, &line, &words);
     let stderr = splatvk(&line).stderr;
     assert!(!String::from_utf8_lossy(&stderr).contains("partial"), "{stderr:?}");
     refuses(
         2,
-        &["export", &at("a.ply"), "--format", "ply", "--spz-version", "2", "--out", &at("c.ply")],
+        &["export", &path_of("a.ply"), "--format", "ply", "--spz-version", "2", "--out", &path_of("c.ply")],
         &["--spz-version"],
     );
 }
 
 #[test]
-fn antialiased_scenes_stay_so_or_are_warned_of() {
+fn export_keeps_or_warns_of_antialiasing() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let path_of = |name: &str| text_path(folder.path(), name);
     let thin = Splats { antialiased: true, ..splats(50) };
-    gaussians::write(at("a.ply").as_ref(), &thin, None).unwrap();
+    gaussians::write(path_of("a.ply").as_ref(), &thin, None).unwrap();
     for (format, ending, kept) in [
         ("ply", "ply", true),
         ("compressed-ply", "compressed.ply", true),
@@ -202,8 +212,8 @@ fn antialiased_scenes_stay_so_or_are_warned_of() {
         ("splat", "splat", false),
         ("glb", "glb", false),
     ] {
-        let out = at(&format!("out.{ending}"));
-        let output = splatvk(&["export", &at("a.ply"), "--format", format, "--out", &out]);
+        let out = path_of(&format!("out.{ending}"));
+        let output = splatvk(&["export", &path_of("a.ply"), "--format", format, "--out", &out]);
         let stderr = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success(), "{stderr}");
         assert_eq!(gaussians::read(out.as_ref()).unwrap().0.antialiased, kept, "{format}");
@@ -211,18 +221,18 @@ fn antialiased_scenes_stay_so_or_are_warned_of() {
     }
 }
 
-/// The warning of a command that is over in no time comes at its end.
+/// A command that ends at once prints the warning at its end.
 #[test]
-fn colours_that_a_format_cuts_off_are_warned_of() {
+fn export_warns_of_clipped_colours() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
+    let path_of = |name: &str| text_path(folder.path(), name);
     // 0.5 + 0.28 · 6 is 2.2 times white.
     let mut bright = splats(50);
     bright.sh[30] = 6.0;
-    gaussians::write(at("bright.ply").as_ref(), &bright, None).unwrap();
+    gaussians::write(path_of("bright.ply").as_ref(), &bright, None).unwrap();
     for (format, warned) in [("splat", true), ("spz", true), ("glb", false)] {
-        let out = at(&format!("out.{format}"));
-        let output = splatvk(&["export", &at("bright.ply"), "--format", format, "--out", &out]);
+        let out = path_of(&format!("out.{format}"));
+        let output = splatvk(&["export", &path_of("bright.ply"), "--format", format, "--out", &out]);
         let stderr = String::from_utf8_lossy(&output.stderr);
         assert!(output.status.success(), "{stderr}");
         assert_eq!(stderr.contains("1 splats are brighter"), warned, "{format}: {stderr}");
@@ -248,21 +258,21 @@ fn write_scene(folder: &Path, s: &Splats, field: Option<&LanguageField>) {
 }
 
 #[test]
-fn a_damaged_scene_directory_is_refused() {
+fn damaged_scene_directory_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let scene = folder.path().join("scene");
     let (path, out) = (scene.to_string_lossy().into_owned(), folder.path().join("o.ply"));
     let out = out.to_string_lossy().into_owned();
-    let refused = |words: &[&str]| {
+    let assert_refused = |words: &[&str]| {
         refuses(2, &["export", &path, "--format", "ply", "--out", &out], words);
         assert!(!Path::new(&out).exists());
     };
     write_scene(&scene, &splats(50), Some(&field(50)));
     assert!(scene_dir::load(&scene).is_ok());
-    poison(&scene.join("point_cloud.ply"), 3, 0, f32::NAN);
-    refused(&["point_cloud.ply", "1 of 50 Gaussians, the first is number 3"]);
+    overwrite(&scene.join("point_cloud.ply"), 3, 0, f32::NAN);
+    assert_refused(&["point_cloud.ply", "1 of 50 Gaussians, the first is number 3"]);
 
-    // 50 features of 1, as they are: no mixes of codes.
+    // 50 features of 1 as stored, not as mixes of codes.
     type Change = fn(&mut Vec<f32>);
     let cases: [(&str, &str, Change, &str); 5] = [
         (
@@ -288,9 +298,9 @@ fn a_damaged_scene_directory_is_refused() {
         *array = npy::NpyArray::f32(&shape, values);
         let list: Vec<(&str, &npy::NpyArray)> = arrays.iter().map(|(n, a)| (n.as_str(), a)).collect();
         npy::write_npz(&archive, &list).unwrap();
-        refused(&[file, words]);
+        assert_refused(&[file, words]);
     }
-    // Nor is it written.
+    // Writing refuses it, too.
     let mut broken = field(50);
     broken.levels[0].features[8] = f32::NAN;
     let e = gaussians::write(folder.path().join("b.ply").as_ref(), &splats(50), Some(&broken)).unwrap_err();
@@ -312,34 +322,38 @@ fn a_damaged_scene_directory_is_refused() {
     }
     assert!(refusals > 20, "{refusals}");
     std::fs::write(&archive, &whole[..whole.len() / 2]).unwrap();
-    refused(&["codebook_s.npz", "copy the file again"]);
+    assert_refused(&["codebook_s.npz", "copy the file again"]);
     std::fs::remove_file(&archive).unwrap();
     std::fs::create_dir(&archive).unwrap();
-    refused(&["codebook_s.npz", "is a folder"]);
+    assert_refused(&["codebook_s.npz", "is a folder"]);
 }
 
 #[test]
-fn questions_need_cameras_and_language() {
+fn query_needs_cameras_and_language() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name).to_string_lossy().into_owned();
-    gaussians::write(at("plain.ply").as_ref(), &splats(5), None).unwrap();
-    gaussians::write(at("words.ply").as_ref(), &splats(5), Some(&field(5))).unwrap();
-    let out = at("out");
-    refuses(2, &["query", &at("plain.ply"), "lemon", "--out", &out], &["plain.ply", "no language"]);
+    let path_of = |name: &str| text_path(folder.path(), name);
+    gaussians::write(path_of("plain.ply").as_ref(), &splats(5), None).unwrap();
+    gaussians::write(path_of("words.ply").as_ref(), &splats(5), Some(&field(5))).unwrap();
+    let out = path_of("out");
+    refuses(2, &["query", &path_of("plain.ply"), "lemon", "--out", &out], &["plain.ply", "no language"]);
     refuses(
         2,
-        &["query", &at("words.ply"), "lemon", "--out", &out],
+        &["query", &path_of("words.ply"), "lemon", "--out", &out],
         &["words.ply", "no cameras", "--cameras"],
     );
-    cameras::write_json(at("none.json").as_ref(), &[]).unwrap();
-    let none = at("none.json");
-    refuses(2, &["query", &at("words.ply"), "lemon", "--cameras", &none, "--out", &out], &["no cameras"]);
+    cameras::write_json(path_of("none.json").as_ref(), &[]).unwrap();
+    let none = path_of("none.json");
+    refuses(
+        2,
+        &["query", &path_of("words.ply"), "lemon", "--cameras", &none, "--out", &out],
+        &["no cameras"],
+    );
     assert!(!Path::new(&out).exists());
 }
 
-/// A folder of somebody else, in which the command is started.
+/// The command starts in a foreign folder.
 #[test]
-fn relative_home_is_never_the_current_folder() {
+fn home_is_never_current_folder() {
     let folder = tempfile::tempdir().unwrap();
     let models = folder.path().join(".local/share/splatvk/models/theirs");
     std::fs::create_dir_all(&models).unwrap();
@@ -353,11 +367,12 @@ fn relative_home_is_never_the_current_folder() {
             }
             let c = c.env("HOME", home).env("XDG_DATA_HOME", data).current_dir(folder.path());
             let output = c.args(arguments).output().unwrap();
-            let said = String::from_utf8_lossy(&output.stderr).into_owned();
-            // The list of users states a folder for most; without one the command is refused.
+            let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+            // The list of users states a folder for most of them; without one the command is
+            // refused.
             assert!(
-                output.status.success() || said.contains("set HOME, or SPLATVK_HOME"),
-                "{:?}: {said}",
+                output.status.success() || stderr.contains("set HOME, or SPLATVK_HOME"),
+                "{:?}: {stderr}",
                 output.status
             );
             let shown = String::from_utf8_lossy(&output.stdout);
@@ -367,46 +382,46 @@ fn relative_home_is_never_the_current_folder() {
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
 }
 
-/// A scene and its report are passed on, kept stages stay with the user.
+/// A scene and its report are passed on; kept stages stay with the user.
 #[cfg(unix)]
 #[test]
-fn folders_as_typed_are_not_in_the_scene() {
+fn scene_contains_no_typed_folders() {
     use std::os::unix::fs::MetadataExt;
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
+    let path_of = |name: &str| folder.path().join(name);
     let (images, cameras, points) = fixture::small_views();
-    let home = at("alice-t/home");
-    std::fs::create_dir_all(at("alice-t/secret-album")).unwrap();
+    let home = path_of("alice-t/home");
+    std::fs::create_dir_all(path_of("alice-t/secret-album")).unwrap();
     std::fs::create_dir_all(&home).unwrap();
     for part in ["lib", "models"] {
         std::os::unix::fs::symlink(splatvk::infer::home().unwrap().join(part), home.join(part)).unwrap();
     }
     for (from, to) in [(cameras, "cameras.json"), (points, "points.ply")] {
-        std::fs::copy(from, at("alice-t/secret-album").join(to)).unwrap();
+        std::fs::copy(from, path_of("alice-t/secret-album").join(to)).unwrap();
     }
-    std::fs::create_dir(at("alice-t/secret-album/photos")).unwrap();
+    std::fs::create_dir(path_of("alice-t/secret-album/photos")).unwrap();
     for entry in std::fs::read_dir(images).unwrap().map(|e| e.unwrap()) {
-        std::fs::copy(entry.path(), at("alice-t/secret-album/photos").join(entry.file_name())).unwrap();
+        std::fs::copy(entry.path(), path_of("alice-t/secret-album/photos").join(entry.file_name())).unwrap();
     }
-    std::fs::write(at("alice-t/secret-album/photos/notes.jpg"), "no photo").unwrap();
+    std::fs::write(path_of("alice-t/secret-album/photos/notes.jpg"), "no photo").unwrap();
     let train = |images: &Path, out: &Path| {
         let mut c = Command::new(env!("CARGO_BIN_EXE_splatvk"));
         c.env("SPLATVK_HOME", &home).arg("train").arg("--images").arg(images);
-        c.arg("--cameras").arg(at("alice-t/secret-album/cameras.json"));
-        c.arg("--points").arg(at("alice-t/secret-album/points.ply"));
+        c.arg("--cameras").arg(path_of("alice-t/secret-album/cameras.json"));
+        c.arg("--points").arg(path_of("alice-t/secret-album/points.ply"));
         let output = c.args(["--iterations", "5", "--resume", "--out"]).arg(out).output().unwrap();
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     };
-    train(&at("alice-t/secret-album/photos"), &at("alice-t/scene"));
+    train(&path_of("alice-t/secret-album/photos"), &path_of("alice-t/scene"));
     for name in ["run.json", "report.html", "cameras/photos.json", "cameras/transforms.json", "scene.json"] {
-        let text = String::from_utf8(std::fs::read(at("alice-t/scene").join(name)).unwrap()).unwrap();
+        let text = String::from_utf8(std::fs::read(path_of("alice-t/scene").join(name)).unwrap()).unwrap();
         let folder = folder.path().to_str().unwrap();
         assert!(
             !text.contains("alice-t") && !text.contains("secret-album") && !text.contains(folder),
             "{name}"
         );
     }
-    let record = std::fs::read_to_string(at("alice-t/scene/run.json")).unwrap();
+    let record = std::fs::read_to_string(path_of("alice-t/scene/run.json")).unwrap();
     assert!(record.contains("\"images\": \"photos\""), "what it was made of: {record}");
     let mode = |path: &Path| path.metadata().unwrap().mode() & 0o777;
     let stages: Vec<_> = std::fs::read_dir(home.join("stages")).unwrap().map(|e| e.unwrap().path()).collect();
@@ -414,7 +429,7 @@ fn folders_as_typed_are_not_in_the_scene() {
     assert!(stages.iter().all(|s| mode(s) == 0o600), "{stages:?}");
 }
 
-/// A chunk of a PNG with its sum.
+/// Chunk of a PNG with its checksum.
 fn chunk(kind: &[u8; 4], data: &[u8]) -> Vec<u8> {
     let mut sum = flate2::Crc::new();
     sum.update(kind);
@@ -423,12 +438,12 @@ fn chunk(kind: &[u8; 4], data: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn panic_of_photo_decoder_is_line() {
+fn decoder_panic_becomes_error_line() {
     use std::io::Write;
     let folder = tempfile::tempdir().unwrap();
     let mut rows = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
     rows.write_all(&[1; 65 * 64]).unwrap();
-    // A palette of one colour and a third.
+    // A palette with one colour and a third of another.
     let png = [
         b"\x89PNG\r\n\x1a\n".to_vec(),
         chunk(b"IHDR", &[0, 0, 0, 64, 0, 0, 0, 64, 8, 3, 0, 0, 0]),

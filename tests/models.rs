@@ -1,5 +1,4 @@
-//! Networks and ONNX Runtime as a user meets them on the command line: listed, explained, refused
-//! in one line.
+//! Networks and ONNX Runtime on the command line: listed, explained, and refused in one line.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -17,7 +16,7 @@ fn photos() -> String {
     format!("{}/tests/data/breakfast/images", env!("CARGO_MANIFEST_DIR"))
 }
 
-/// The one error line of a run that must be refused with exit code 2.
+/// Returns the only error line of a run that must be refused with exit code 2.
 fn refusal(args: &[&str], set: &[(&str, &str)]) -> String {
     let (code, _, stderr) = splatvk(args, set);
     let lines: Vec<&str> = stderr.lines().filter(|l| l.starts_with("splatvk: ")).collect();
@@ -26,7 +25,7 @@ fn refusal(args: &[&str], set: &[(&str, &str)]) -> String {
 }
 
 #[test]
-fn known_networks_are_listed_with_licence_source_and_place() {
+fn models_lists_licence_and_source() {
     let (code, text, _) = splatvk(&["models", "list"], &[]);
     assert_eq!(code, 0);
     for part in [
@@ -51,7 +50,7 @@ fn known_networks_are_listed_with_licence_source_and_place() {
 }
 
 #[test]
-fn a_network_that_is_not_there_or_broken_is_explained_before_the_work() {
+fn broken_network_fails_before_work() {
     let folder = tempfile::tempdir().unwrap();
     let home = std::env::var("SPLATVK_HOME").unwrap_or_default();
     let own = if home.is_empty() { dirs() } else { home };
@@ -76,7 +75,7 @@ fn a_network_that_is_not_there_or_broken_is_explained_before_the_work() {
     assert!(!out.exists());
 }
 
-/// `~/.local/share/splatvk`, as the program finds it.
+/// `~/.local/share/splatvk`, found as the program finds it.
 fn dirs() -> String {
     let set = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
     let data =
@@ -85,7 +84,7 @@ fn dirs() -> String {
 }
 
 #[test]
-fn an_onnx_runtime_that_is_missing_or_too_old_is_named() {
+fn unusable_onnx_runtime_is_named() {
     let photos = photos();
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("scene");
@@ -103,12 +102,16 @@ fn an_onnx_runtime_that_is_missing_or_too_old_is_named() {
 }
 
 #[test]
-fn the_environment_chooses_what_computes_the_networks() {
-    let (code, said, _) = splatvk(&["doctor", "--json"], &[("SPLATVK_PROVIDER", "gpu")]);
-    assert!(code == 2 && said.contains("provider gpu: unknown; choose one of auto, cpu"), "{code}: {said}");
+fn unknown_provider_of_environment_is_refused() {
+    let (code, stdout, _) = splatvk(&["doctor", "--json"], &[("SPLATVK_PROVIDER", "gpu")]);
+    assert!(
+        code == 2 && stdout.contains("provider gpu: unknown; choose one of auto, cpu"),
+        "{code}: {stdout}"
+    );
 }
 
-/// A library that says it is ONNX Runtime 1.10: the two functions that a program asks first.
+/// Builds a library that reports ONNX Runtime 1.10, with the two functions that a program calls
+/// first.
 fn old_runtime(library: &Path) {
     let source = library.with_extension("c");
     let code = "static const void *api(unsigned v) { (void)v; return 0; }\n\

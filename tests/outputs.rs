@@ -1,5 +1,5 @@
-//! The rule for everything that a command writes where a user says: never over what is there
-//! without --force, never over a symbolic link or a device, all of it or none.
+//! Outputs of commands: existing files are replaced only with --force, symbolic links and devices
+//! never, and an output is written as a whole or not at all.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
@@ -17,8 +17,8 @@ fn splatvk(args: &[OsString]) -> Output {
     c.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).args(args).output().unwrap()
 }
 
-/// The command must end with exit code 2 and one line on standard error that contains the words.
-fn refused(args: &[OsString], words: &str) {
+/// Expects exit code 2 and one line on standard error that contains the words.
+fn assert_refused(args: &[OsString], words: &str) {
     let output = splatvk(args);
     let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{args:?}: {stderr}");
@@ -38,9 +38,14 @@ fn names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// A command line that ends with the place to write to.
-fn line(words: &str, place: &Path) -> Vec<OsString> {
-    let path = |name: &str| match name {
+/// Command line that ends with the output path.
+fn command_line(words: &str, place: &Path) -> Vec<OsString> {
+    words.split(' ').map(argument).chain([place.into()]).collect()
+}
+
+/// Argument of a command: the path of a placeholder, or the word itself.
+fn argument(name: &str) -> OsString {
+    match name {
         "SCENE" => scene().into(),
         "CAMERAS" => scene().join("cameras/transforms.json").into(),
         "TRUTH" => data("breakfast").into(),
@@ -48,8 +53,7 @@ fn line(words: &str, place: &Path) -> Vec<OsString> {
         "IMAGES" => small_views().0.into(),
         "KNOWN" => small_views().1.into(),
         word => OsString::from(word),
-    };
-    words.split(' ').map(path).chain([place.into()]).collect()
+    }
 }
 
 fn forced(mut line: Vec<OsString>) -> Vec<OsString> {
@@ -57,7 +61,7 @@ fn forced(mut line: Vec<OsString>) -> Vec<OsString> {
     line
 }
 
-/// Commands that write a file, and those that write a folder.
+/// Commands that write a file; then those that write a folder.
 const FILES: [&str; 4] = [
     "export SCENE --format ply --out",
     "export SCENE --format spz --out",
@@ -72,11 +76,11 @@ const FOLDERS: [&str; 6] = [
     "bench --write-scene",
     "manuals",
 ];
-/// Those whose folder is replaced as a whole, where it is a scene.
+/// Commands that replace their folder as a whole if it is a scene.
 const SCENES: [&str; 2] = ["run PHOTOS --out", "train --images IMAGES --cameras KNOWN --out"];
 
 #[test]
-fn nothing_is_written_over_without_force() {
+fn outputs_replace_only_with_force() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("letter");
     std::fs::write(&file, "precious").unwrap();
@@ -84,19 +88,19 @@ fn nothing_is_written_over_without_force() {
     std::fs::create_dir(&full).unwrap();
     std::fs::write(full.join("letter"), "precious").unwrap();
     for words in FILES {
-        refused(&line(words, &file), "--force");
-        refused(&forced(line(words, &full)), "a folder is in the way");
+        assert_refused(&command_line(words, &file), "--force");
+        assert_refused(&forced(command_line(words, &full)), "a folder is in the way");
     }
     for words in FOLDERS {
-        refused(&line(words, &full), "--force");
-        refused(&forced(line(words, &file)), "a file is in the way");
+        assert_refused(&command_line(words, &full), "--force");
+        assert_refused(&forced(command_line(words, &file)), "a file is in the way");
     }
     for words in SCENES {
-        refused(&forced(line(words, &full)), "not a scene");
-        refused(&forced(line(words, &file)), "a file is in the way");
-        refused(&line(words, scene()), "--force");
+        assert_refused(&forced(command_line(words, &full)), "not a scene");
+        assert_refused(&forced(command_line(words, &file)), "a file is in the way");
+        assert_refused(&command_line(words, scene()), "--force");
     }
-    refused(&forced(line("generate --out", &full)), "not empty and not generated data");
+    assert_refused(&forced(command_line("generate --out", &full)), "not empty and not generated data");
     assert_eq!(std::fs::read_to_string(&file).unwrap(), "precious");
     assert_eq!(std::fs::read_to_string(full.join("letter")).unwrap(), "precious");
     assert_eq!(
@@ -106,38 +110,40 @@ fn nothing_is_written_over_without_force() {
 }
 
 #[test]
-fn links_and_devices_are_never_written_over() {
+fn outputs_never_replace_links_or_devices() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
-    std::fs::write(at("letter"), "precious").unwrap();
-    std::fs::create_dir(at("empty")).unwrap();
+    let path_of = |name: &str| folder.path().join(name);
+    std::fs::write(path_of("letter"), "precious").unwrap();
+    std::fs::create_dir(path_of("empty")).unwrap();
     for (link, target) in [("to-file", "letter"), ("to-folder", "empty"), ("to-nothing", "nothing")] {
-        symlink(at(target), at(link)).unwrap();
+        symlink(path_of(target), path_of(link)).unwrap();
     }
-    symlink(scene(), at("to-scene")).unwrap();
+    symlink(scene(), path_of("to-scene")).unwrap();
     for words in FILES.into_iter().chain(FOLDERS).chain(SCENES) {
         for link in ["to-file", "to-folder", "to-nothing", "to-scene"] {
-            refused(&forced(line(words, &at(link))), "symbolic link");
+            assert_refused(&forced(command_line(words, &path_of(link))), "symbolic link");
         }
-        refused(&forced(line(words, Path::new("/dev/null"))), "device");
+        assert_refused(&forced(command_line(words, Path::new("/dev/null"))), "device");
     }
-    refused(&line("generate --out", &at("to-folder")), "symbolic link");
+    assert_refused(&command_line("generate --out", &path_of("to-folder")), "symbolic link");
     assert!(std::fs::symlink_metadata("/dev/null").unwrap().file_type().is_char_device());
-    assert_eq!(std::fs::read_to_string(at("letter")).unwrap(), "precious");
+    assert_eq!(std::fs::read_to_string(path_of("letter")).unwrap(), "precious");
     assert!(
-        names(&at("empty")).is_empty() && !at("nothing").exists() && scene().join("scene.json").is_file()
+        names(&path_of("empty")).is_empty()
+            && !path_of("nothing").exists()
+            && scene().join("scene.json").is_file()
     );
-    assert!(["to-file", "to-folder", "to-nothing", "to-scene"].iter().all(|l| at(l).is_symlink()));
+    assert!(["to-file", "to-folder", "to-nothing", "to-scene"].iter().all(|l| path_of(l).is_symlink()));
 }
 
 #[test]
-fn with_force_files_of_the_same_names_are_replaced_and_others_stay() {
+fn force_replaces_only_same_names() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
+    let path_of = |name: &str| folder.path().join(name);
     for (k, words) in FILES.into_iter().enumerate() {
-        let file = at(&format!("file-{k}"));
+        let file = path_of(&format!("file-{k}"));
         std::fs::write(&file, "old").unwrap();
-        succeeds(&forced(line(words, &file)));
+        succeeds(&forced(command_line(words, &file)));
         assert!(std::fs::metadata(&file).unwrap().len() > 100, "{words}");
     }
     for (words, file) in [
@@ -146,11 +152,11 @@ fn with_force_files_of_the_same_names_are_replaced_and_others_stay() {
         ("manuals", "splatvk.1"),
         ("bench --splats 100 --width 64 --height 48 --write-scene", "scene.json"),
     ] {
-        let out = at("results").join(words.split(' ').next().unwrap());
+        let out = path_of("results").join(words.split(' ').next().unwrap());
         std::fs::create_dir_all(&out).unwrap();
         std::fs::write(out.join(file), "old").unwrap();
         std::fs::write(out.join("letter"), "precious").unwrap();
-        succeeds(&forced(line(words, &out)));
+        succeeds(&forced(command_line(words, &out)));
         assert!(std::fs::metadata(out.join(file)).unwrap().len() > 100, "{words}");
         assert_eq!(std::fs::read_to_string(out.join("letter")).unwrap(), "precious");
         assert!(names(&out).iter().all(|n| !n.contains("partial")));
@@ -158,77 +164,80 @@ fn with_force_files_of_the_same_names_are_replaced_and_others_stay() {
 }
 
 #[test]
-fn generated_data_is_replaced_as_a_whole_and_only_where_nothing_else_lies_in_it() {
+fn force_replaces_only_pure_data_sets() {
     let folder = tempfile::tempdir().unwrap();
     let data = folder.path().join("data");
-    let words = |views: u32| format!("generate --seed 1000 --size 64x64 --views {views} --held-out 0 --out");
-    succeeds(&line(&words(3), &data));
-    refused(&line(&words(2), &data), "--force");
+    succeeds(&command_line(&generate_words(3), &data));
+    assert_refused(&command_line(&generate_words(2), &data), "--force");
     let regions = format!("generate --from {} --out", data.display());
-    refused(&forced(line(&regions, &data)), "is read, and lies in");
-    succeeds(&forced(line(&words(2), &data)));
+    assert_refused(&forced(command_line(&regions, &data)), "is read, and lies in");
+    succeeds(&forced(command_line(&generate_words(2), &data)));
     assert_eq!(names(&data.join("images")), ["train_00.jpg", "train_01.jpg"], "no photo of the older data");
     let regions = format!("generate --from {} --out", data.display());
     let out = folder.path().join("regions");
-    succeeds(&line(&regions, &out));
-    succeeds(&forced(line(&regions, &out)));
+    succeeds(&command_line(&regions, &out));
+    succeeds(&forced(command_line(&regions, &out)));
     std::fs::write(data.join("letter"), "precious").unwrap();
-    refused(&forced(line(&words(2), &data)), "did not write: letter;");
+    assert_refused(&forced(command_line(&generate_words(2), &data)), "did not write: letter;");
     assert_eq!(std::fs::read_to_string(data.join("letter")).unwrap(), "precious");
     assert_eq!(names(folder.path()), ["data", "regions"]);
 }
 
+fn generate_words(views: u32) -> String {
+    format!("generate --seed 1000 --size 64x64 --views {views} --held-out 0 --out")
+}
+
 #[test]
-fn a_model_in_one_form_replaces_that_in_the_other() {
+fn colmap_model_replaces_other_form() {
     let folder = tempfile::tempdir().unwrap();
     let model = folder.path().join("model");
     let forms = [("colmap", "txt"), ("colmap-bin", "bin"), ("colmap", "txt")];
     for (k, (format, ending)) in forms.into_iter().enumerate() {
-        let line = line(&format!("export SCENE --format {format} --out"), &model);
+        let line = command_line(&format!("export SCENE --format {format} --out"), &model);
         succeeds(&if k == 0 { line } else { forced(line) });
         std::fs::write(model.join("letter"), "precious").unwrap();
         let mut all: Vec<String> = ["cameras", "images", "points3D"].map(|n| format!("{n}.{ending}")).into();
         all.insert(2, "letter".into());
         assert_eq!(names(&model), all);
     }
-    // What may not be written over may not be removed either.
+    // A link is not removed, either.
     symlink(model.join("letter"), model.join("images.bin")).unwrap();
-    refused(&forced(line("export SCENE --format colmap --out", &model)), "symbolic link");
+    assert_refused(&forced(command_line("export SCENE --format colmap --out", &model)), "symbolic link");
     assert!(model.join("images.bin").is_symlink() && model.join("images.txt").is_file());
 }
 
 #[test]
-fn a_scene_is_not_written_into_by_its_own_export() {
+fn export_never_writes_into_scene() {
     let before = std::fs::read(scene().join("point_cloud.ply")).unwrap();
     for (format, place) in [("ply", "point_cloud.ply"), ("colmap", "cameras/colmap"), ("colmap", "cameras")] {
         let words = format!("export SCENE --format {format} --out");
-        refused(&forced(line(&words, &scene().join(place))), "a part of the scene");
+        assert_refused(&forced(command_line(&words, &scene().join(place))), "a part of the scene");
     }
     assert_eq!(std::fs::read(scene().join("point_cloud.ply")).unwrap(), before);
 }
 
-/// With files of at most so many blocks of 512 bytes.
+/// Runs a command whose files are limited to a number of blocks of 512 bytes.
 fn limited(blocks: u64, args: &[OsString]) -> Output {
     fixture::command::limited(blocks, fixture::command::splatvk().args(args)).output().unwrap()
 }
 
 #[test]
-fn a_full_disk_leaves_no_half_of_a_folder() {
+fn full_disk_leaves_no_partial_folder() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out/model");
     for format in ["colmap", "colmap-bin"] {
         // Cameras and images take less than a block of 512 bytes each, points more.
         let words = format!("export SCENE --format {format} --out");
-        let output = limited(4, &line(&words, &out));
+        let output = limited(4, &command_line(&words, &out));
         let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(2), "{stderr}");
         assert!(stderr.lines().count() == 1 && stderr.contains("limit"), "{stderr}");
         assert!(names(folder.path()).is_empty(), "{:?}", names(folder.path()));
     }
-    // Two files, of which the second is a zip archive.
+    // Two files; the second is a zip archive.
     let file = folder.path().join("scene.splat");
     for blocks in [4, 16, 64, 256] {
-        let output = limited(blocks, &line("export SCENE --format splat --out", &file));
+        let output = limited(blocks, &command_line("export SCENE --format splat --out", &file));
         let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
         let lines: Vec<&str> = stderr.lines().filter(|l| !l.starts_with("warning: ")).collect();
         assert!(
@@ -237,15 +246,18 @@ fn a_full_disk_leaves_no_half_of_a_folder() {
         );
         assert!(names(folder.path()).is_empty(), "{blocks}: {:?}", names(folder.path()));
     }
-    succeeds(&line("export SCENE --format colmap --out", &out));
+    succeeds(&command_line("export SCENE --format colmap --out", &out));
     let before: Vec<Vec<u8>> = names(&out).iter().map(|n| std::fs::read(out.join(n)).unwrap()).collect();
-    assert_eq!(limited(4, &forced(line("export SCENE --format colmap --out", &out))).status.code(), Some(2));
+    assert_eq!(
+        limited(4, &forced(command_line("export SCENE --format colmap --out", &out))).status.code(),
+        Some(2)
+    );
     let after: Vec<Vec<u8>> = names(&out).iter().map(|n| std::fs::read(out.join(n)).unwrap()).collect();
     assert!(before.len() == 3 && before == after, "the old model is whole");
 }
 
-/// `clean` in a folder, with a home of its own: what it says of unfinished files.
-fn cleaned(folder: &Path, extra: &[&str]) -> serde_json::Value {
+/// Runs `clean` in a folder with a home of its own, and returns its report of unfinished files.
+fn clean_report(folder: &Path, extra: &[&str]) -> serde_json::Value {
     let mut clean = Command::new(env!("CARGO_BIN_EXE_splatvk"));
     clean.env("SPLATVK_HOME", folder.join("home")).current_dir(folder).args(["clean", "--json"]).args(extra);
     let output = clean.output().unwrap();
@@ -256,86 +268,91 @@ fn cleaned(folder: &Path, extra: &[&str]) -> serde_json::Value {
 }
 
 #[test]
-fn leftovers_of_killed_commands_go_with_the_next_and_with_clean() {
+fn leftovers_are_removed_later() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
+    let path_of = |name: &str| folder.path().join(name);
     let leave = || {
         for place in ["a.ply", "b.ply", "scene"] {
-            abandon(&at(&format!(".{place}.partial-splatvk")), place);
+            abandon(&path_of(&format!(".{place}.partial-splatvk")), place);
         }
-        abandon(&at("answers/.partial-splatvk"), "answers");
+        abandon(&path_of("answers/.partial-splatvk"), "answers");
     };
     leave();
-    succeeds(&line("export SCENE --format ply --out", &at("a.ply")));
+    succeeds(&command_line("export SCENE --format ply --out", &path_of("a.ply")));
     let kept = [".b.ply.partial-splatvk", ".scene.partial-splatvk", "a.ply", "answers"];
     assert_eq!(names(folder.path()), kept, "only those of the same place");
-    // A folder with nothing but a leftover is empty.
-    succeeds(&line("export SCENE --format colmap --out", &at("answers")));
-    assert_eq!(names(&at("answers")), ["cameras.txt", "images.txt", "points3D.txt"]);
-    std::fs::remove_dir_all(at("answers")).unwrap();
+    // A folder that contains only a leftover counts as empty.
+    succeeds(&command_line("export SCENE --format colmap --out", &path_of("answers")));
+    assert_eq!(names(&path_of("answers")), ["cameras.txt", "images.txt", "points3D.txt"]);
+    std::fs::remove_dir_all(path_of("answers")).unwrap();
     for name in [".b.ply.partial-splatvk", ".scene.partial-splatvk"] {
-        std::fs::remove_dir_all(at(name)).unwrap();
+        std::fs::remove_dir_all(path_of(name)).unwrap();
     }
     leave();
-    let told = cleaned(folder.path(), &[]);
+    let told = clean_report(folder.path(), &[]);
     assert!(told["files"] == 4 && told["paths"].to_string().contains(".b.ply.partial-splatvk"), "{told}");
-    assert!(at(".b.ply.partial-splatvk").exists(), "told, not deleted");
+    assert!(path_of(".b.ply.partial-splatvk").exists(), "told, not deleted");
     let elsewhere = tempfile::tempdir().unwrap();
     abandon(&elsewhere.path().join(".c.ply.partial-splatvk"), "c.ply");
     let again = elsewhere.path().join("..").join(elsewhere.path().file_name().unwrap());
     let named = [elsewhere.path(), &again].map(|p| p.to_str().unwrap());
-    assert_eq!(cleaned(folder.path(), &["--delete", named[0], named[1], "."])["files"], 5, "each once");
-    assert_eq!(cleaned(folder.path(), &[])["files"], 0);
+    assert_eq!(clean_report(folder.path(), &["--delete", named[0], named[1], "."])["files"], 5, "each once");
+    assert_eq!(clean_report(folder.path(), &[])["files"], 0);
     assert_eq!(names(folder.path()), ["a.ply", "answers"]);
     assert!(names(elsewhere.path()).is_empty());
 }
 
 #[test]
-fn clean_deletes_nothing_without_an_owners_mark() {
+fn clean_needs_owner_mark() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
-    std::fs::create_dir_all(at("precious/sub")).unwrap();
-    std::fs::write(at("precious/sub/IMG.jpg"), "precious").unwrap();
-    abandon(&at("precious/.x.partial-splatvk"), "x");
-    std::fs::create_dir(at("work")).unwrap();
+    let path_of = |name: &str| folder.path().join(name);
+    std::fs::create_dir_all(path_of("precious/sub")).unwrap();
+    std::fs::write(path_of("precious/sub/IMG.jpg"), "precious").unwrap();
+    abandon(&path_of("precious/.x.partial-splatvk"), "x");
+    std::fs::create_dir(path_of("work")).unwrap();
     for link in ["link.partial-99999999", ".link.partial-splatvk", ".partial-splatvk"] {
-        symlink("../precious", at("work").join(link)).unwrap();
+        symlink("../precious", path_of("work").join(link)).unwrap();
     }
-    symlink("../precious/.x.partial-splatvk", at("work/.x.partial-splatvk")).unwrap();
-    std::fs::write(at("work/notes.partial-20240115.md"), "precious").unwrap();
-    std::fs::write(at("work/.a.partial-splatvk"), "precious").unwrap();
+    symlink("../precious/.x.partial-splatvk", path_of("work/.x.partial-splatvk")).unwrap();
+    std::fs::write(path_of("work/notes.partial-20240115.md"), "precious").unwrap();
+    std::fs::write(path_of("work/.a.partial-splatvk"), "precious").unwrap();
     for shoot in [".shoot.partial-20250101", ".shoot.partial-splatvk"] {
-        std::fs::create_dir(at("work").join(shoot)).unwrap();
-        std::fs::write(at("work").join(shoot).join("IMG.jpg"), "precious").unwrap();
+        std::fs::create_dir(path_of("work").join(shoot)).unwrap();
+        std::fs::write(path_of("work").join(shoot).join("IMG.jpg"), "precious").unwrap();
     }
-    let before = names(&at("work"));
-    assert_eq!(cleaned(&at("work"), &["--delete"])["files"], 0);
-    // A refused command, too, leaves everything, and a leftover of our own.
-    abandon(&at("work/.mine.partial-splatvk"), "mine");
-    refused(&line("render SCENE --cameras CAMERAS --out", &at("work")), "not empty");
-    refused(&line("export SCENE --format ply --out", &at("work/.a.partial-splatvk")), "--force");
-    refused(&line("export SCENE --format ply --out", &at("work/shoot")), "bears no mark");
-    assert!(at("work/.mine.partial-splatvk/owner").exists());
-    std::fs::remove_dir_all(at("work/.mine.partial-splatvk")).unwrap();
-    assert_eq!(names(&at("work")), before);
+    let before = names(&path_of("work"));
+    assert_eq!(clean_report(&path_of("work"), &["--delete"])["files"], 0);
+    // A refused command leaves everything in place, even a leftover of splatvk.
+    abandon(&path_of("work/.mine.partial-splatvk"), "mine");
+    assert_refused(&command_line("render SCENE --cameras CAMERAS --out", &path_of("work")), "not empty");
+    assert_refused(
+        &command_line("export SCENE --format ply --out", &path_of("work/.a.partial-splatvk")),
+        "--force",
+    );
+    assert_refused(&command_line("export SCENE --format ply --out", &path_of("work/shoot")), "bears no mark");
+    assert!(path_of("work/.mine.partial-splatvk/owner").exists());
+    std::fs::remove_dir_all(path_of("work/.mine.partial-splatvk")).unwrap();
+    assert_eq!(names(&path_of("work")), before);
     for shoot in [".shoot.partial-20250101", ".shoot.partial-splatvk"] {
-        assert!(at("work").join(shoot).join("IMG.jpg").exists());
+        assert!(path_of("work").join(shoot).join("IMG.jpg").exists());
     }
-    assert!(at("precious/sub/IMG.jpg").exists() && at("precious/.x.partial-splatvk/owner").exists());
+    assert!(
+        path_of("precious/sub/IMG.jpg").exists() && path_of("precious/.x.partial-splatvk/owner").exists()
+    );
 }
 
 #[test]
-fn foreign_files_and_inputs_are_never_replaced() {
+fn outputs_never_replace_foreign_files() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
-    // A project that has a scene.json of its own, with the photos in it.
-    std::fs::create_dir_all(at("project/photos")).unwrap();
-    std::fs::write(at("project/scene.json"), r#"{"three": true}"#).unwrap();
+    let path_of = |name: &str| folder.path().join(name);
+    // A project with a scene.json of its own that contains the photos.
+    std::fs::create_dir_all(path_of("project/photos")).unwrap();
+    std::fs::write(path_of("project/scene.json"), r#"{"three": true}"#).unwrap();
     for words in SCENES {
-        refused(&forced(line(words, &at("project"))), "not a scene");
+        assert_refused(&forced(command_line(words, &path_of("project"))), "not a scene");
     }
-    copy(scene(), &at("room"));
-    std::fs::write(at("room/.DS_Store"), "x").unwrap();
+    copy(scene(), &path_of("room"));
+    std::fs::write(path_of("room/.DS_Store"), "x").unwrap();
     let train = |images: &Path, cameras: &Path| {
         let line: [OsString; 9] = [
             "train".into(),
@@ -348,32 +365,40 @@ fn foreign_files_and_inputs_are_never_replaced() {
             "--sh-degree=0".into(),
             "--out".into(),
         ];
-        forced(line.into_iter().chain([at("room").into()]).collect())
+        forced(line.into_iter().chain([path_of("room").into()]).collect())
     };
     let (images, cameras, points) = small_views();
-    // Photos and notes that somebody has put into a scene.
-    std::fs::create_dir(at("room/my-photos")).unwrap();
-    std::fs::write(at("room/NOTES.txt"), "precious").unwrap();
-    refused(&train(&images, &cameras), "did not write: NOTES.txt, my-photos;");
-    std::fs::remove_dir(at("room/my-photos")).unwrap();
-    std::fs::remove_file(at("room/NOTES.txt")).unwrap();
-    // What the scene itself has, as an input.
-    refused(&train(&images, &at("room/cameras/original/transforms.json")), "is read, and lies in");
-    refused(&train(&at("room/cameras/images"), &cameras), "is read, and lies in");
+    // Foreign photos and notes in a scene.
+    std::fs::create_dir(path_of("room/my-photos")).unwrap();
+    std::fs::write(path_of("room/NOTES.txt"), "precious").unwrap();
+    assert_refused(&train(&images, &cameras), "did not write: NOTES.txt, my-photos;");
+    std::fs::remove_dir(path_of("room/my-photos")).unwrap();
+    std::fs::remove_file(path_of("room/NOTES.txt")).unwrap();
+    // An input inside the scene itself.
+    assert_refused(
+        &train(&images, &path_of("room/cameras/original/transforms.json")),
+        "is read, and lies in",
+    );
+    assert_refused(&train(&path_of("room/cameras/images"), &cameras), "is read, and lies in");
     let mut with_points = train(&images, &cameras);
-    with_points.extend(["--points".into(), at("room/point_cloud.ply").into()]);
-    refused(&with_points, "is read, and lies in");
+    with_points.extend(["--points".into(), path_of("room/point_cloud.ply").into()]);
+    assert_refused(&with_points, "is read, and lies in");
     let export = format!("export {} --format ply --out", points.display());
-    refused(&forced(line(&export, &points)), "is read, and lies in");
-    let render = format!("render {0} --cameras {0}/cameras/transforms.json --out", at("room").display());
-    refused(&forced(line(&render, &at("room/cameras/images"))), "what this command reads");
-    assert!(at("room/scene.json").exists() && at("room/cameras/images").exists());
-    // A scene with nothing else in it is replaced.
-    let before = std::fs::read(at("room/run.json")).unwrap();
+    assert_refused(&forced(command_line(&export, &points)), "is read, and lies in");
+    let render = format!("render {0} --cameras {0}/cameras/transforms.json --out", path_of("room").display());
+    assert_refused(
+        &forced(command_line(&render, &path_of("room/cameras/images"))),
+        "what this command reads",
+    );
+    assert!(path_of("room/scene.json").exists() && path_of("room/cameras/images").exists());
+    // A scene without foreign files is replaced.
+    let before = std::fs::read(path_of("room/run.json")).unwrap();
     let mut whole = train(&images, &cameras);
     whole.extend(["--points".into(), points.into()]);
     succeeds(&whole);
-    assert!(std::fs::read(at("room/run.json")).unwrap() != before && !at("room/.DS_Store").exists());
+    assert!(
+        std::fs::read(path_of("room/run.json")).unwrap() != before && !path_of("room/.DS_Store").exists()
+    );
     assert_eq!(names(folder.path()), ["project", "room"]);
 }
 
@@ -389,7 +414,7 @@ fn copy(from: &Path, to: &Path) {
 }
 
 #[test]
-fn second_command_for_one_place_is_refused() {
+fn concurrent_output_is_refused() {
     for words in [
         "train --images IMAGES --cameras KNOWN --iterations 1000000 --out",
         "bench training --splats 2000 --seconds 600 --json",
@@ -398,7 +423,7 @@ fn second_command_for_one_place_is_refused() {
         let place = folder.path().join("out");
         let mut first = Command::new(env!("CARGO_BIN_EXE_splatvk"));
         first.env_remove("SPLATVK_MODELS").stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
-        let mut first = first.args(line(words, &place)).spawn().unwrap();
+        let mut first = first.args(command_line(words, &place)).spawn().unwrap();
         let marks =
             [".out.partial-splatvk/owner", "out/.partial-splatvk/owner"].map(|m| folder.path().join(m));
         let begun = Instant::now();
@@ -407,26 +432,26 @@ fn second_command_for_one_place_is_refused() {
             std::thread::sleep(Duration::from_millis(20));
         }
         let name = format!("process {}", first.id());
-        for again in [line(words, &place), forced(line(words, &place))] {
-            refused(&again, &name);
+        for again in [command_line(words, &place), forced(command_line(words, &place))] {
+            assert_refused(&again, &name);
         }
-        refused(
-            &line("export SCENE --format ply --out", &place),
+        assert_refused(
+            &command_line("export SCENE --format ply --out", &place),
             if place.is_dir() { "folder" } else { &name },
         );
-        // Killed, it is in nobody's way.
+        // A killed command does not block others.
         first.kill().unwrap();
         first.wait().unwrap();
-        assert_eq!(cleaned(folder.path(), &["--delete"])["files"], 1, "{words}");
+        assert_eq!(clean_report(folder.path(), &["--delete"])["files"], 1, "{words}");
         std::fs::remove_dir_all(folder.path().join("home")).ok();
         let left: Vec<String> = names(folder.path()).into_iter().filter(|n| n != "out").collect();
         assert!(left.is_empty() && (!place.is_dir() || names(&place).is_empty()), "{left:?}");
     }
 }
 
-/// Commands that take longer than the test, each with what it has written when it is told to stop.
+/// Interrupts commands that run longer than the test, after they have started to write.
 #[test]
-fn told_to_stop_a_command_leaves_nothing() {
+fn terminated_command_leaves_nothing() {
     let lines = [
         "train --images IMAGES --cameras KNOWN --iterations 1000000 --out",
         "bench training --splats 2000 --seconds 600 --json",
@@ -440,7 +465,7 @@ fn told_to_stop_a_command_leaves_nothing() {
             .stdin(Stdio::null())
             .stdout(Stdio::null())
             .stderr(Stdio::piped());
-        let child = command.args(line(words, &place)).spawn().unwrap();
+        let child = command.args(command_line(words, &place)).spawn().unwrap();
         std::thread::sleep(Duration::from_secs(2));
         let told = Instant::now();
         Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap();

@@ -1,7 +1,7 @@
-//! Every rasterisation pass on the GPU against its f64 reference, with validation on.
+//! Compares every rasterisation pass on the GPU with its f64 reference, with validation on.
 mod support;
 use glam::DVec3;
-use splatvk::gpu::{Recorder, test_device};
+use splatvk::gpu::{Device, Recorder, test_device};
 use splatvk::math::Random;
 use splatvk::pass::channels::BASE_CHANNELS;
 use splatvk::pass::raster_backward;
@@ -13,7 +13,7 @@ use splatvk::scene::seeded;
 use splatvk::scene::{Pose, Splats};
 use support::{IMAGE, Scene, assert_close, assert_images, assert_lists, rendered};
 
-/// A splat in front of an unrotated camera, round, grey unless coloured.
+/// Round splat in front of an unrotated camera, grey unless coloured.
 fn splat(mean: [f32; 3], scale: f32, opacity_logit: f32) -> Splats {
     Splats {
         means: vec![mean],
@@ -50,7 +50,7 @@ fn random_scenes_match_reference() {
 }
 
 #[test]
-fn linear_features_and_lower_degrees_match_reference() {
+fn linear_features_match_reference() {
     let device = test_device();
     let mut scene = Scene::small(60, 3, 5, 3);
     scene.options = RasterOptions { feature_mode: FeatureMode::Linear, sh_degree: 1, ..scene.options };
@@ -63,7 +63,7 @@ fn linear_features_and_lower_degrees_match_reference() {
 
 /// One round splat on the axis: o e^(−½ r² / (f²s²/z² + 0.3)), in closed form.
 #[test]
-fn single_gaussian_has_its_analytic_image() {
+fn single_gaussian_matches_closed_form() {
     let device = test_device();
     let (logit, scale, z) = (0.7f64, 0.12f64, 2.5f64);
     let scene = front_scene(splat([0.0, 0.0, z as f32], scale as f32, logit as f32), 48, 32);
@@ -81,8 +81,7 @@ fn single_gaussian_has_its_analytic_image() {
     assert_close("transmittance", &out.transmittance, &expected, &IMAGE);
 }
 
-/// With one colour everywhere and a black background the image is colour · A, whatever the splats
-/// are.
+/// With one colour everywhere and a black background the image is colour · A for all splats.
 #[test]
 fn constant_colour_gives_colour_times_alpha() {
     let device = test_device();
@@ -100,7 +99,7 @@ fn constant_colour_gives_colour_times_alpha() {
 }
 
 #[test]
-fn order_of_splats_does_not_matter() {
+fn image_is_independent_of_order() {
     let device = test_device();
     let scene = Scene::small(400, 2, 0, 12);
     let order = Random::new(1).permutation(400);
@@ -118,14 +117,14 @@ fn order_of_splats_does_not_matter() {
     let other = Scene { splats: shuffled, features: Vec::new(), ..Scene::small(1, 0, 0, 0) };
     let other = Scene { view: scene.view.clone(), options: scene.options, ..other };
     let (a, b) = (scene.render(&device), other.render(&device));
-    // Depths differ, so the sorted order and with it every rounding is the same.
+    // Depths differ, so the sorted order and all roundings are the same.
     assert_eq!(a.planes, b.planes);
     assert_eq!(a.transmittance, b.transmittance);
 }
 
-/// Equal depths keep the order of the splats: the first one wins, on both sides.
+/// Equal depths keep the order of the splats: the first one is in front, in both versions.
 #[test]
-fn identical_depths_are_drawn_in_index_order() {
+fn equal_depths_keep_index_order() {
     let device = test_device();
     let mut splats = splat([0.0, 0.0, 2.0], 0.3, 4.0);
     for i in 1..20 {
@@ -137,18 +136,18 @@ fn identical_depths_are_drawn_in_index_order() {
 }
 
 #[test]
-fn near_opaque_needle_huge_hidden_and_outside_splats_match_reference() {
+fn extreme_splats_match_reference() {
     let device = test_device();
     let mut splats = splat([0.1, 0.0, 2.0], 0.2, 12.0); // opacity 0.999994: α is clamped at 0.99
     append(&mut splats, splat([0.0, 0.1, -2.0], 0.5, 3.0)); // behind
     append(&mut splats, splat([0.0, 0.0, 0.04], 0.5, 3.0)); // in front of the near plane
     append(&mut splats, splat([40.0, 0.0, 2.0], 0.1, 3.0)); // far outside the image
-    append(&mut splats, splat([-1.9, 0.3, 2.0], 0.9, 1.0)); // outside, but reaches in; clamped Jacobian
+    append(&mut splats, splat([-1.9, 0.3, 2.0], 0.9, 1.0)); // outside, but reaches into the image; clamped Jacobian
     append(&mut splats, splat([0.0, 0.0, 9.0], 30.0, 0.0)); // covers everything
-    append(&mut splats, splat([0.2, 0.2, 3.0], 1e-6, 2.0)); // smaller than a pixel: the dilation carries it
+    append(&mut splats, splat([0.2, 0.2, 3.0], 1e-6, 2.0)); // smaller than a pixel: visible by the dilation alone
     append(&mut splats, splat([0.0, 0.2, 3.0], 0.1, -9.0)); // opacity below 1/255
     append(&mut splats, splat([0.0, 0.2, 3.0], 0.1, -200.0)); // exp would overflow
-    let mut needle = splat([-0.1, -0.1, 2.2], 1.0, 2.0); // 1 : 1000, at an angle
+    let mut needle = splat([-0.1, -0.1, 2.2], 1.0, 2.0); // 1 : 1000, rotated
     needle.log_scales[0] = [0.8f32.ln(), 0.0008f32.ln(), 0.0008f32.ln()];
     needle.quats[0] = [0.9, 0.1, -0.2, 0.35];
     append(&mut splats, needle);
@@ -159,17 +158,17 @@ fn near_opaque_needle_huge_hidden_and_outside_splats_match_reference() {
     assert_images(&scene.render(&device), &reference);
 }
 
-/// The lists hold what the reference's exact test finds, nearest first, plus at most the few that its
-/// margin lets in.
+/// The lists contain all entries of the reference's exact test, nearest first, and a few more
+/// within the margin of the GPU's test.
 #[test]
-fn tile_lists_contain_the_twins() {
+fn tile_lists_contain_reference_entries() {
     let scene = Scene::small(500, 0, 0, 77);
     let (total, extra) = assert_lists(&test_device(), &scene);
     assert!(total > 1000 && extra * 100 < total, "{extra} of {total}");
 }
 
 #[test]
-fn the_lists_of_a_view_hold_nothing_of_the_view_before() {
+fn tile_lists_forget_last_view() {
     let device = test_device();
     let whole = front_scene(splat([0.0, 0.0, 5.0], 50.0, -3.0), 40, 40);
     // Nothing in the first 24 of 25 tiles.
@@ -188,10 +187,10 @@ fn the_lists_of_a_view_hold_nothing_of_the_view_before() {
     }
 }
 
-/// lavapipe leaves the loops of a shader after 65535 rounds: more lanes share the 4.7 million
+/// lavapipe leaves the loops of a shader after 65535 iterations: more lanes share the 4.7 million
 /// entries of these lists.
 #[test]
-fn long_lists_are_listed_whole() {
+fn long_lists_are_complete() {
     let device = test_device();
     let mut splats = Splats::default();
     for k in 0..300 {
@@ -208,19 +207,19 @@ fn long_lists_are_listed_whole() {
     }
 }
 
-/// Many splats within the middle one of three tiles, and one farther away in its corner: it is
-/// shown, or the frame is refused.
+/// Many splats in the middle one of three tiles, and a farther one in its corner: either it is
+/// drawn, or the frame is refused.
 #[test]
-fn no_splat_of_a_long_list_is_left_out_without_an_error() {
+fn long_list_is_complete_or_refused() {
     let device = test_device();
     for (count, refused) in [(39_000, false), (70_000, device.info().leaves_long_loops())] {
         // The focal length is 21.6 pixels, the principal point (12, 4).
-        let at = |pixel: f32, z: f32| [(pixel - 4.0) * z / 21.6, (pixel - 4.0) * z / 21.6, z];
+        let on_diagonal = |pixel: f32, z: f32| [(pixel - 4.0) * z / 21.6, (pixel - 4.0) * z / 21.6, z];
         let mut splats = Splats { sh_degree: 0, ..Splats::default() };
         for k in 0..count {
-            append(&mut splats, splat(at(2.5, 1.0 + 1e-5 * k as f32), 1e-4, 0.0));
+            append(&mut splats, splat(on_diagonal(2.5, 1.0 + 1e-5 * k as f32), 1e-4, 0.0));
         }
-        append(&mut splats, splat(at(6.5, 3.0), 0.02, 5.0));
+        append(&mut splats, splat(on_diagonal(6.5, 3.0), 0.02, 5.0));
         let scene = front_scene(splats, 24, 8);
         let (params, mut raster) = scene.upload(&device);
         let outcome = raster.forward(&params, &scene.options);
@@ -235,8 +234,8 @@ fn no_splat_of_a_long_list_is_left_out_without_an_error() {
     }
 }
 
-/// 20 000 splats in one tile (10⁵ take the reference too long): nothing overflows, saturates or
-/// loses its order.
+/// 20 000 splats in one tile (10⁵ take the reference too long), without overflow, saturation or
+/// disorder.
 #[test]
 fn crowded_tile_matches_reference() {
     let device = test_device();
@@ -244,7 +243,7 @@ fn crowded_tile_matches_reference() {
     let mut splats = Splats::default();
     for _ in 0..20_000 {
         let (x, y) = (random.scaled_normal(0.02) as f32, random.scaled_normal(0.02) as f32);
-        // α of about 0.005: the pixel is still open after hundreds of them.
+        // α of about 0.005: the pixel is not yet saturated after hundreds of splats.
         append(&mut splats, splat([x, y, random.between(2.0, 6.0) as f32], 0.05, -5.2));
         let at = splats.sh.len() - 3;
         splats.sh[at] = random.scaled_normal(0.5) as f32;
@@ -254,9 +253,9 @@ fn crowded_tile_matches_reference() {
 }
 
 #[test]
-fn too_short_lists_are_reported_grown_and_never_half_drawn() {
+fn overflowing_lists_grow_before_drawing() {
     let device = test_device();
-    // 40 splats that each cover all of 38 × 25 tiles: far more entries than the first guess.
+    // 40 splats that each cover all of 38 × 25 tiles: far more entries than first allocated.
     let mut splats = Splats::default();
     for i in 0..40 {
         append(&mut splats, splat([0.0, 0.0, 5.0 + i as f32], 50.0, -3.0));
@@ -276,7 +275,7 @@ fn too_short_lists_are_reported_grown_and_never_half_drawn() {
 }
 
 #[test]
-fn renderer_returns_the_planes_as_maps() {
+fn renderer_returns_planes_as_maps() {
     let device = test_device();
     let scene = Scene::small(200, 1, 3, 21);
     let (_, camera) = seeded::small(200, 75, 53, 1, 21);
@@ -296,14 +295,13 @@ fn renderer_returns_the_planes_as_maps() {
         let depth = if alpha >= 0.5 { out.planes[3 * pixels + p] / alpha } else { 0.0 };
         assert_eq!(frame.depth.at(x, y), depth);
     }
-    // Another size on the same renderer.
+    // Another size with the same renderer.
     assert_eq!(renderer.render(&camera.resized(40, 28)).unwrap().rgb.data.len(), 40 * 28);
 }
 
-/// The near plane that nobody set is a hundredth of the median depth of what lies before the
-/// camera.
+/// The default near plane is a hundredth of the median depth of the splats in front of the camera.
 #[test]
-fn splats_behind_the_camera_neither_show_nor_count_for_the_near_plane() {
+fn splats_behind_camera_are_ignored() {
     let device = test_device();
     let camera = seeded::camera(24, 16, Pose::IDENTITY);
     let image = |splats: &Splats| Renderer::new(&device, splats, &[], 0).unwrap().render(&camera).unwrap();
@@ -316,10 +314,10 @@ fn splats_behind_the_camera_neither_show_nor_count_for_the_near_plane() {
     assert!(image(&splats) == seen);
 }
 
-/// What a splat shows of a view, with colours and features that must not matter, in one band and in
-/// strips of the image.
+/// Weights of splats in a view, in one band and in strips of the image; colours and features must
+/// not matter.
 #[test]
-fn weights_of_a_view_match_reference() {
+fn view_weights_match_reference() {
     let device = test_device();
     for (n, dim) in [(300, 0), (120, 3)] {
         let scene = Scene::small(n, 2, dim, 33);
@@ -341,7 +339,7 @@ fn weights_of_a_view_match_reference() {
         let weights = renderer.weights(&camera).unwrap();
         let most = expected.iter().copied().fold(0.0, f64::max);
         for (i, (got, want)) in weights.iter().zip(&expected).enumerate() {
-            // Where alpha is just at its bound, one pixel may count on one side only.
+            // If alpha is just at its bound, one pixel may count in one version only.
             assert!((f64::from(*got) - want).abs() <= 1e-4 * most + 0.005, "splat {i}: {got} {want}");
         }
         let alpha: f64 = forward.image.transmittance.iter().map(|t| 1.0 - t).sum();
@@ -349,7 +347,7 @@ fn weights_of_a_view_match_reference() {
         assert!((sum / alpha - 1.0).abs() < 1e-3, "all weights are all of what is opaque: {sum} {alpha}");
         assert_eq!(renderer.weights(&camera).unwrap().len(), n, "a second time on the same buffers");
     }
-    // A wall before a splat: nothing of it shows.
+    // A wall hides the splat behind it.
     let mut splats = splat([0.0, 0.0, 2.0], 0.8, 9.0);
     for k in 1..6 {
         append(&mut splats, splat([0.0, 0.0, 2.0 + 0.01 * k as f32], 0.8, 9.0));
@@ -361,7 +359,7 @@ fn weights_of_a_view_match_reference() {
 }
 
 #[test]
-fn unusable_input_is_an_error() {
+fn rasterizer_refuses_unusable_input() {
     let device = test_device();
     let (mut splats, camera) = seeded::small(3, 16, 16, 0, 0);
     assert!(Rasterizer::new(&device, 3, 0, 0, 16).is_err(), "no pixels");
@@ -375,7 +373,7 @@ fn unusable_input_is_an_error() {
 }
 
 #[test]
-fn no_splats_give_the_background() {
+fn empty_scene_shows_background() {
     let device = test_device();
     let scene = front_scene(Splats::default(), 16, 9);
     let out = scene.render(&device);
@@ -390,18 +388,19 @@ fn no_splats_give_the_background() {
 /// gsplat's `rasterize_mode="antialiased"`: the opacity of a splat of variance v px² is multiplied
 /// by v / (v + 0.3).
 #[test]
-fn antialiased_opacity_falls_with_the_dilation() {
+fn antialiased_opacity_follows_dilation() {
     let device = test_device();
-    let alpha = |antialiased: bool| {
-        // At depth 2: 0.5 px wide.
-        let mut scene = front_scene(splat([0.0, 0.0, 2.0], 1.0, 0.0), 33, 33);
-        let sigma = 0.5f32;
-        scene.splats.log_scales = vec![[(sigma * 2.0 / scene.view.focal[0] as f32).ln(); 3]];
-        scene.splats.antialiased = antialiased;
-        let rendered = scene.render(&device);
-        assert_images(&rendered, &scene.reference());
-        rendered.transmittance.iter().map(|t| 1.0 - t).fold(0.0, f32::max)
-    };
-    let ratio = alpha(true) / alpha(false);
+    let ratio = max_alpha(&device, true) / max_alpha(&device, false);
     assert!((ratio - 0.25 / 0.55).abs() < 1e-3, "{ratio}");
+}
+
+/// Largest alpha of a splat 0.5 px wide at depth 2.
+fn max_alpha(device: &Device, antialiased: bool) -> f32 {
+    let mut scene = front_scene(splat([0.0, 0.0, 2.0], 1.0, 0.0), 33, 33);
+    let sigma = 0.5f32;
+    scene.splats.log_scales = vec![[(sigma * 2.0 / scene.view.focal[0] as f32).ln(); 3]];
+    scene.splats.antialiased = antialiased;
+    let rendered = scene.render(device);
+    assert_images(&rendered, &scene.reference());
+    rendered.transmittance.iter().map(|t| 1.0 - t).fold(0.0, f32::max)
 }

@@ -1,4 +1,4 @@
-//! Photo loading from real files: kinds of JPEG and PNG, EXIF, and sets that must be refused.
+//! Photo loading from real files: kinds of JPEG and PNG, EXIF, and sets that are refused.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 use exif::{Tag, Value};
 use image::ImageEncoder;
@@ -12,8 +12,7 @@ fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
 }
 
-/// Asserts 8-bit colours at four positions. The expected values come from Pillow 13 reading the
-/// same files.
+/// Compares 8-bit colours at four positions with those that Pillow 13 reads from the same files.
 fn assert_colours(photo: &Photo, expected: [[u8; 3]; 4], tolerance: f32) {
     for ((x, y), e) in [(5, 5), (90, 10), (40, 50), (90, 60)].into_iter().zip(expected) {
         let c = photo.image.at(x, y).map(|v| v * 255.0);
@@ -27,7 +26,7 @@ fn read(inputs: &[PathBuf], views: Option<usize>) -> splatvk::Result<Vec<photo::
 }
 
 #[test]
-fn kinds_of_files_agree_with_another_reader() {
+fn file_kinds_match_pillow() {
     // JPEG decoders may differ by rounding of the inverse DCT and of the chroma interpolation: 3 of
     // 255.
     let cmyk = photo::load(&data("photos/cmyk.jpg")).unwrap();
@@ -38,7 +37,7 @@ fn kinds_of_files_agree_with_another_reader() {
     assert_colours(&palette, [[13, 11, 247], [231, 41, 156], [104, 197, 165], [231, 230, 107]], 0.01);
 }
 
-/// An EXIF block.
+/// EXIF block with the given tags.
 fn exif_of<const N: usize>(tags: [(Tag, Value); N]) -> Vec<u8> {
     let fields = tags.map(|(tag, value)| exif::Field { tag, ifd_num: exif::In::PRIMARY, value });
     let mut writer = exif::experimental::Writer::new();
@@ -49,15 +48,15 @@ fn exif_of<const N: usize>(tags: [(Tag, Value); N]) -> Vec<u8> {
 }
 
 #[test]
-fn a_tall_photo_is_scaled_with_its_focal_and_orientation() {
+fn tall_photo_scales_focal_length() {
     let folder = tempfile::tempdir().unwrap();
     let raw = exif_of([
         (Tag::Orientation, Value::Short(vec![6])),
         (Tag::FocalLengthIn35mmFilm, Value::Short(vec![28])),
         (Tag::Model, Value::Ascii(vec![b"Phone".to_vec()])),
     ]);
-    // Stored 2000 × 1200 lying on its side, left half red: upright 1200 × 2000 with the upper half
-    // red.
+    // Stored lying on its side as 2000 × 1200 with a red left half: upright 1200 × 2000 with a red
+    // upper half.
     let stored = image::RgbImage::from_fn(2000, 1200, |x, _| {
         image::Rgb(if x < 1000 { [220, 0, 0] } else { [0, 0, 220] })
     });
@@ -77,14 +76,14 @@ fn a_tall_photo_is_scaled_with_its_focal_and_orientation() {
     assert_eq!(photo.to_working.apply([1200.0, 2000.0]), [960.0, 1600.0]);
 }
 
-/// A photo that a decoder of the system must read.
+/// Loads a photo that only a decoder of the system reads.
 fn heif(name: &str) -> Photo {
     photo::load(&data(&format!("photos/{name}")))
         .unwrap_or_else(|e| panic!("{e}\nthe tests need what tools/setup installs"))
 }
 
 #[test]
-fn heic_and_avif_are_read_upright_with_their_lens() {
+fn heif_is_read_upright_with_lens() {
     let original =
         photo::load(&data("breakfast/images/train_00.jpg")).unwrap().image.resized_by_area(160, 120);
     for name in ["turned.heic", "deep.heic", "small.avif"] {
@@ -97,7 +96,7 @@ fn heic_and_avif_are_read_upright_with_their_lens() {
         // The encoders were set to about 35 dB; a turned or mirrored picture is below 15 dB.
         assert!(psnr > 30.0, "{name}: {psnr:.1} dB");
     }
-    // This file says twice that it is turned, in `irot` and in EXIF, as phones do: it counts once.
+    // This file states its rotation twice, in `irot` and in EXIF, as phones do: it is applied once.
     let turned = heif("turned.heic");
     assert!((turned.exif_focal.unwrap() - 28.0 / 43.2666 * 200.0).abs() < 0.01);
     assert_eq!(turned.camera_model.as_deref(), Some("Acme Phone 3"));
@@ -105,7 +104,7 @@ fn heic_and_avif_are_read_upright_with_their_lens() {
 }
 
 #[test]
-fn ten_bits_are_kept() {
+fn heic_keeps_ten_bits() {
     let levels: std::collections::BTreeSet<u32> =
         heif("deep.heic").image.data.iter().flatten().map(|v| (v * 1023.0 * 16.0).round() as u32).collect();
     let on_the_10_bit_grid = levels.iter().filter(|v| (**v + 1) % 16 <= 2).count();
@@ -113,7 +112,7 @@ fn ten_bits_are_kept() {
 }
 
 #[test]
-fn damaged_heic_is_one_line() {
+fn damaged_heif_gives_one_line() {
     for name in ["turned.heic", "small.avif"] {
         let whole = std::fs::read(data(&format!("photos/{name}"))).unwrap();
         for cut in (0..whole.len()).step_by(53) {
@@ -127,7 +126,7 @@ fn damaged_heic_is_one_line() {
 }
 
 #[test]
-fn a_folder_is_read_in_order() {
+fn folder_is_read_in_order() {
     let photos = photo::load_all(&[data("breakfast/images")], &Silent).unwrap();
     let stems: Vec<_> = photos.iter().map(|p| p.stem.as_str()).collect();
     assert_eq!(stems, ["train_00", "train_01", "train_02", "train_03"], "held-out views must not be here");
@@ -135,47 +134,49 @@ fn a_folder_is_read_in_order() {
 }
 
 #[test]
-fn unusable_sets_are_refused_in_one_line() {
+fn unusable_photo_sets_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let dir = folder.path();
-    let refuse = |inputs: &[PathBuf], views: Option<usize>, words: &[&str]| {
-        let e = read(inputs, views).unwrap_err();
-        let message = e.to_string();
-        assert_eq!((e.exit_code(), message.lines().count()), (2, 1), "{message}");
-        assert!(words.iter().all(|w| message.contains(w)), "{message}");
-    };
-    // As macOS leaves them beside every photo on a memory card.
+    // macOS leaves such files beside photos on a memory card.
     std::fs::write(dir.join("._a.jpg"), b"\0\x05\x16\x07").unwrap();
-    refuse(&[dir.to_path_buf()], None, &["no photos"]);
-    refuse(&[dir.join("nothing")], None, &["nothing", "does not exist"]);
+    assert_refused(&[dir.to_path_buf()], None, &["no photos"]);
+    assert_refused(&[dir.join("nothing")], None, &["nothing", "does not exist"]);
     std::fs::write(dir.join("clip.mp4"), b"\0\0\0\x18ftypmp42").unwrap();
-    refuse(&[dir.to_path_buf()], None, &["clip.mp4", "video"]);
-    refuse(&[dir.join("clip.mp4")], None, &["clip.mp4", "video"]);
+    assert_refused(&[dir.to_path_buf()], None, &["clip.mp4", "video"]);
+    assert_refused(&[dir.join("clip.mp4")], None, &["clip.mp4", "video"]);
     let source = |i: u32| data(&format!("breakfast/images/train_{i:02}.jpg"));
     std::fs::copy(source(0), dir.join("a.jpg")).unwrap();
-    refuse(&[dir.to_path_buf()], None, &["a.jpg", "only one photo"]);
+    assert_refused(&[dir.to_path_buf()], None, &["a.jpg", "only one photo"]);
     std::fs::copy(source(0), dir.join("b.jpg")).unwrap();
-    refuse(&[dir.to_path_buf()], None, &["a.jpg", "b.jpg", "the same photo twice"]);
-    refuse(&[dir.to_path_buf()], Some(3), &["--views 3", "only 2"]);
-    refuse(&[dir.to_path_buf()], Some(1), &["--views 1"]);
+    assert_refused(&[dir.to_path_buf()], None, &["a.jpg", "b.jpg", "the same photo twice"]);
+    assert_refused(&[dir.to_path_buf()], Some(3), &["--views 3", "only 2"]);
+    assert_refused(&[dir.to_path_buf()], Some(1), &["--views 1"]);
     std::fs::create_dir(dir.join("c")).unwrap();
     std::fs::copy(source(1), dir.join("c/a.jpg")).unwrap();
-    refuse(&[dir.join("a.jpg"), dir.join("c/a.jpg")], None, &["two photos with the name \"a\""]);
+    assert_refused(&[dir.join("a.jpg"), dir.join("c/a.jpg")], None, &["two photos with the name \"a\""]);
     image::RgbImage::new(20, 300).save(dir.join("b.png")).unwrap();
-    refuse(&[dir.join("a.jpg"), dir.join("b.png")], None, &["b.png", "20 × 300"]);
+    assert_refused(&[dir.join("a.jpg"), dir.join("b.png")], None, &["b.png", "20 × 300"]);
     let mut encoder =
         image::codecs::png::PngEncoder::new(std::fs::File::create(dir.join("round.png")).unwrap());
     let lens = Value::Ascii(vec![b"Samyang 8mm f/2.8 Fisheye".to_vec()]);
     encoder.set_exif_metadata(exif_of([(Tag::LensModel, lens)])).unwrap();
     encoder.write_image(&[90; 100 * 80], 100, 80, image::ExtendedColorType::L8).unwrap();
     let named = ["round.png", "fisheye lens (Samyang 8mm f/2.8 Fisheye)"];
-    refuse(&[dir.join("a.jpg"), dir.join("round.png")], None, &named);
+    assert_refused(&[dir.join("a.jpg"), dir.join("round.png")], None, &named);
     let whole = std::fs::read(source(2)).unwrap();
     std::fs::write(dir.join("b.jpg"), &whole[..whole.len() / 2]).unwrap();
-    refuse(&[dir.join("a.jpg"), dir.join("b.jpg")], None, &["b.jpg", "cut off"]);
+    assert_refused(&[dir.join("a.jpg"), dir.join("b.jpg")], None, &["b.jpg", "cut off"]);
 }
 
-/// A program that makes test data, or `None` with a word about it where it is not installed.
+/// Expects exit code 2 and one line that contains the words.
+fn assert_refused(inputs: &[PathBuf], views: Option<usize>, words: &[&str]) {
+    let e = read(inputs, views).unwrap_err();
+    let message = e.to_string();
+    assert_eq!((e.exit_code(), message.lines().count()), (2, 1), "{message}");
+    assert!(words.iter().all(|w| message.contains(w)), "{message}");
+}
+
+/// Program that makes test data; reports if it is not installed, and returns `None`.
 fn program(name: &str) -> Option<std::process::Command> {
     let there = std::process::Command::new(name).arg("-version").output().is_ok();
     if !there {
@@ -184,13 +185,11 @@ fn program(name: &str) -> Option<std::process::Command> {
     there.then(|| std::process::Command::new(name))
 }
 
-/// The four photos as a video of twelve frames, two of them blurred; `options` go before the
-/// output.
-fn clip(folder: &Path, name: &str, options: &[&str]) -> Option<PathBuf> {
+/// The four photos as a video of twelve frames, two of them blurred; `options` precede the output.
+fn make_clip(folder: &Path, name: &str, options: &[&str]) -> Option<PathBuf> {
     let frames = folder.join("frames");
     std::fs::create_dir_all(&frames).unwrap();
-    // Each photo three times, as a camera that stands still: repeated frames must not be chosen
-    // together.
+    // Each photo three times, like a camera at rest: repeated frames must not be chosen together.
     for i in 0..12 {
         let photo = data(&format!("breakfast/images/train_{:02}.jpg", i / 3));
         std::fs::copy(photo, frames.join(format!("{i:02}.jpg"))).unwrap();
@@ -205,9 +204,9 @@ fn clip(folder: &Path, name: &str, options: &[&str]) -> Option<PathBuf> {
 }
 
 #[test]
-fn a_video_gives_sharp_frames_from_different_places() {
+fn video_gives_sharp_distinct_frames() {
     let folder = tempfile::tempdir().unwrap();
-    let Some(path) = clip(folder.path(), "my.clip.mp4", &[]) else { return };
+    let Some(path) = make_clip(folder.path(), "my.clip.mp4", &[]) else { return };
     let candidates = photo::gather(std::slice::from_ref(&path), &Silent).unwrap();
     let names: Vec<_> = candidates.iter().map(photo::Candidate::name).collect();
     assert_eq!((names.len(), names[1].as_str()), (12, "my_clip_0000200"));
@@ -219,7 +218,7 @@ fn a_video_gives_sharp_frames_from_different_places() {
     assert_eq!(photos.len(), 4);
     assert!(photos.iter().all(|p| (p.image.width, p.image.height) == (640, 480) && p.exif_focal.is_none()));
     assert_eq!(photos[0].stem, names[chosen[0]]);
-    // Frames are what the photos were, up to the codec.
+    // Frames equal the photos, up to the codec.
     let original = photo::load(&data("breakfast/images/train_03.jpg")).unwrap();
     let off: f64 =
         photos[3].image.data.iter().zip(&original.image.data).map(|(a, b)| (a[1] - b[1]).abs() as f64).sum();
@@ -227,9 +226,9 @@ fn a_video_gives_sharp_frames_from_different_places() {
 }
 
 #[test]
-fn bad_videos_are_one_line() {
+fn bad_videos_give_one_line() {
     let folder = tempfile::tempdir().unwrap();
-    let Some(path) = clip(folder.path(), "clip.mp4", &[]) else { return };
+    let Some(path) = make_clip(folder.path(), "clip.mp4", &[]) else { return };
     let refuse = |path: &Path, words: &[&str]| {
         let e = read(&[path.to_path_buf()], None).unwrap_err();
         let message = e.to_string();
@@ -241,7 +240,7 @@ fn bad_videos_are_one_line() {
     refuse(&folder.path().join("cut.mp4"), &["cut.mp4", "cannot be read"]);
     std::fs::write(folder.path().join("text.mov"), b"no video at all").unwrap();
     refuse(&folder.path().join("text.mov"), &["text.mov", "cannot be read"]);
-    // A list of other files in the clothes of a video, which ffmpeg by itself would play.
+    // A list of other files under the name of a video, which ffmpeg would play by default.
     let list = "ffconcat version 1.0\nfile clip.mp4\nduration 2.4\n";
     std::fs::write(folder.path().join("list.mp4"), list).unwrap();
     refuse(&folder.path().join("list.mp4"), &["list.mp4", "cannot be read"]);
@@ -250,16 +249,16 @@ fn bad_videos_are_one_line() {
 /// Upper left, upper right, lower left, lower right of the pictures below.
 const QUADRANTS: [[u8; 3]; 4] = [[230, 40, 40], [40, 200, 60], [30, 60, 220], [240, 240, 240]];
 
-/// An upright picture of four colours, in its own kind of pixels.
+/// Upright picture of four colours, in the given pixel format.
 fn quadrants(kind: &str, (w, h): (u32, u32)) -> image::DynamicImage {
     use image::{DynamicImage, RgbImage};
-    let at = |x: u32, y: u32| QUADRANTS[usize::from(2 * x >= w) + 2 * usize::from(2 * y >= h)];
+    let colour = |x: u32, y: u32| QUADRANTS[usize::from(2 * x >= w) + 2 * usize::from(2 * y >= h)];
     if kind.contains("luma8") {
-        // Of a picture of 108 megapixels not three bytes per pixel.
-        let grey = |x, y| image::Luma([at(x, y)[0]]);
+        // A picture of 108 megapixels must not need three bytes per pixel.
+        let grey = |x, y| image::Luma([colour(x, y)[0]]);
         return image::GrayImage::from_fn(w, h, grey).into();
     }
-    let rgb = DynamicImage::from(RgbImage::from_fn(w, h, |x, y| image::Rgb(at(x, y))));
+    let rgb = DynamicImage::from(RgbImage::from_fn(w, h, |x, y| image::Rgb(colour(x, y))));
     match kind {
         "rgba8" => rgb.to_rgba8().into(),
         "rgb16" => rgb.to_rgb16().into(),
@@ -270,7 +269,7 @@ fn quadrants(kind: &str, (w, h): (u32, u32)) -> image::DynamicImage {
     }
 }
 
-/// Writes a picture so that only its EXIF orientation makes it upright.
+/// Writes a picture that only its EXIF orientation makes upright.
 fn write_turned(path: &Path, upright: &image::DynamicImage, orientation: u8) {
     let raw = exif_of([(Tag::Orientation, Value::Short(vec![u16::from(orientation)]))]);
     let mut stored = upright.clone();
@@ -293,7 +292,7 @@ fn write_turned(path: &Path, upright: &image::DynamicImage, orientation: u8) {
     }
 }
 
-/// Loads a picture of four colours, and holds it against what it is.
+/// Loads a picture of four colours and compares it with the original.
 fn check_quadrants(path: &Path, kind: &str, (w, h): (u32, u32)) {
     let named = format!("{} {w} × {h}", path.display());
     let photo = match photo::load(path) {
@@ -311,13 +310,13 @@ fn check_quadrants(path: &Path, kind: &str, (w, h): (u32, u32)) {
     assert!(w.min(h) >= photo::SMALLEST_SIDE as u32, "{named}");
     assert_eq!(photo.original_size, (w, h), "{named}");
     let (pw, ph) = (photo.image.width, photo.image.height);
-    // The longer side is capped, as far as the shorter one keeps what the networks need.
+    // The longer side is capped unless the shorter one falls below the minimum of the networks.
     let fits = pw.max(ph) <= photo::MAX_SIZE || pw.min(ph) == photo::SMALLEST_SIDE;
     assert!(fits && pw.min(ph) >= photo::SMALLEST_SIDE, "{named}: {pw} × {ph}");
     assert_quadrants(&photo.image, kind, &named);
 }
 
-/// Asserts the colours in the middle of each quadrant.
+/// Compares the colours in the middle of each quadrant.
 fn assert_quadrants(picture: &RgbImage, kind: &str, named: &str) {
     let (w, h) = (picture.width, picture.height);
     for (k, colour) in QUADRANTS.into_iter().enumerate() {
@@ -329,18 +328,18 @@ fn assert_quadrants(picture: &RgbImage, kind: &str, named: &str) {
 }
 
 #[test]
-fn small_versions_show_the_whole_photo() {
+fn thumbnail_covers_whole_photo() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.png");
     quadrants("rgb8", (640, 480)).save(&path).unwrap();
-    // At a tenth of the size not all pixels are looked at.
+    // At a tenth of the size not all pixels are sampled.
     let small = photo::Candidate::file(&path).thumbnail(64, &Silent).unwrap().unwrap();
     assert_eq!((small.width, small.height), (64, 48));
     assert_quadrants(&small, "rgb8", "small version");
 }
 
 #[test]
-fn the_picture_goes_on_where_a_photo_has_a_plain_frame() {
+fn plain_frame_is_filled_by_picture() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("framed.png");
     let mut framed = quadrants("rgb8", (128, 96)).to_rgb8();
@@ -357,7 +356,7 @@ fn the_picture_goes_on_where_a_photo_has_a_plain_frame() {
 }
 
 #[test]
-fn photos_of_every_size_kind_and_orientation_are_upright_or_refused() {
+fn all_photo_variants_load_upright() {
     let folder = tempfile::tempdir().unwrap();
     let sizes = [(1, 1), (1, 4000), (63, 64), (64, 64), (65, 4096), (4099, 67), (640, 481), (2001, 1203)];
     let kinds = [
@@ -373,8 +372,8 @@ fn photos_of_every_size_kind_and_orientation_are_upright_or_refused() {
     ];
     for (i, size) in sizes.into_iter().enumerate() {
         for (j, file) in kinds.into_iter().enumerate() {
-            // Every size meets every kind; with nine kinds all eight orientations come to each size
-            // and to each kind.
+            // Every size with every kind; with nine kinds, all eight orientations occur with each
+            // size and each kind.
             let orientation = 1 + (i + j) as u8 % 8;
             let (kind, _) = file.split_once('.').unwrap();
             let path = folder.path().join(format!("{i}-{orientation}-{file}"));
@@ -382,14 +381,14 @@ fn photos_of_every_size_kind_and_orientation_are_upright_or_refused() {
             check_quadrants(&path, kind, size);
         }
     }
-    // 108 megapixels, as the largest sensors of phones give them.
+    // 108 megapixels, as the largest sensors of phones produce.
     let path = folder.path().join("large-luma8.jpg");
     write_turned(&path, &quadrants("luma8", (12_000, 9_000)), 6);
     check_quadrants(&path, "luma8", (12_000, 9_000));
 }
 
 #[test]
-fn colours_are_those_of_the_files_profile() {
+fn colours_follow_icc_profile() {
     let folder = tempfile::tempdir().unwrap();
     let icc = moxcms::ColorProfile::new_display_p3().encode().unwrap();
     let picture = quadrants("rgb8", (128, 96));
@@ -409,7 +408,7 @@ fn colours_are_those_of_the_files_profile() {
         }
         seen.push(photo::load(&path).unwrap().image.at(96, 24).map(|v| 255.0 * v));
     }
-    // The green of Display P3 has less red in sRGB: none, since it lies outside.
+    // The green of Display P3 has less red in sRGB: none, since it lies outside the gamut.
     assert!((seen[0][0] - 40.0).abs() < 4.0 && seen[1][0] < 4.0 && seen[2][0] < 1.0, "{seen:?}");
     assert!((seen[1][1] - seen[2][1]).abs() < 4.0, "{seen:?}");
 }
@@ -417,18 +416,18 @@ fn colours_are_those_of_the_files_profile() {
 /// `small.avif` with an ICC profile: a fifth property of its only item (ISO/IEC 23008-12).
 fn avif_with(icc: &[u8]) -> Vec<u8> {
     let mut file = std::fs::read(data("photos/small.avif")).unwrap();
-    let at = |name: &[u8; 4]| file.windows(4).position(|w| w == name).unwrap() - 4;
-    let [meta, iloc, iprp, ipco, ipma] = [b"meta", b"iloc", b"iprp", b"ipco", b"ipma"].map(at);
+    let box_start = |name: &[u8; 4]| file.windows(4).position(|w| w == name).unwrap() - 4;
+    let [meta, iloc, iprp, ipco, ipma] = [b"meta", b"iloc", b"iprp", b"ipco", b"ipma"].map(box_start);
     let number = |file: &[u8], at: usize| u32::from_be_bytes(file[at..at + 4].try_into().unwrap());
     let end = ipma + number(&file, ipma) as usize;
     let colr = [&(icc.len() as u32 + 12).to_be_bytes()[..], b"colrprof", icc].concat();
     let grown = colr.len() as u32;
-    // The sizes of the boxes, and in `iloc` where the pixels begin.
+    // Sizes of the boxes, and in `iloc` the offset of the pixels.
     for (at, by) in [(meta, grown + 1), (iloc + 20, grown + 1), (iprp, grown + 1), (ipco, grown), (ipma, 1)] {
         let value = number(&file, at) + by;
         file[at..at + 4].copy_from_slice(&value.to_be_bytes());
     }
-    // The item's list of properties, by their numbers.
+    // The item's list of property indices.
     file[ipma + 18] += 1;
     file.insert(end, 5);
     file.splice(ipma..ipma, colr);
@@ -436,7 +435,7 @@ fn avif_with(icc: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn an_avif_with_a_profile_looks_as_the_same_png_with_it() {
+fn avif_profile_matches_png() {
     let folder = tempfile::tempdir().unwrap();
     let icc = moxcms::ColorProfile::new_display_p3().encode().unwrap();
     let avif = photo::from_bytes(Path::new("p3.avif"), avif_with(&icc), photo::MAX_SIZE).unwrap();
@@ -453,12 +452,12 @@ fn an_avif_with_a_profile_looks_as_the_same_png_with_it() {
 }
 
 #[test]
-fn code_points_of_avif_are_used() {
+fn avif_code_points_are_used() {
     let mut file = std::fs::read(data("photos/small.avif")).unwrap();
     let at = file.windows(8).position(|w| w == b"colrnclx").unwrap() + 8;
     let plain = heif("small.avif").image;
     let bytes: Vec<u8> = plain.data.as_flattened().iter().map(|v| (255.0 * v).round() as u8).collect();
-    // BT.2020 with PQ, Display P3, and as it is.
+    // BT.2020 with PQ, Display P3, and unspecified.
     for [primaries, transfer] in [[9u8, 16], [12, 13], [2, 2]] {
         (file[at + 1], file[at + 3]) = (primaries, transfer);
         let avif = photo::from_bytes(Path::new("a.avif"), file.clone(), photo::MAX_SIZE).unwrap();
@@ -486,19 +485,10 @@ fn saturation(image: &RgbImage) -> f32 {
 }
 
 #[test]
-fn hdr_video_has_colours_of_its_photos() {
+fn hdr_video_matches_photo_colours() {
     let folder = tempfile::tempdir().unwrap();
     let original = photo::load(&data("breakfast/images/train_00.jpg")).unwrap().image;
     let to_2020 = [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.088, 0.8956f32]];
-    let hlg = |l: f32| {
-        // Diffuse white at 0.75 of the signal: ITU-R BT.2408.
-        let e = l * 0.265;
-        if e <= 1.0 / 12.0 {
-            (3.0 * e).sqrt()
-        } else {
-            0.178_832_77 * (12.0 * e - 0.284_668_92).ln() + 0.559_910_7
-        }
-    };
     let pixels = original.data.iter().flat_map(|c| {
         let light = c.map(splatvk::scene::to_linear);
         to_2020.map(|r| (65535.0 * hlg((0..3).map(|k| r[k] * light[k]).sum::<f32>().max(0.0))) as u16)
@@ -527,8 +517,18 @@ fn hdr_video_has_colours_of_its_photos() {
     assert!(off < 0.02, "colours differ by {off} on average");
 }
 
+/// Hybrid log-gamma signal of linear light; diffuse white is at 0.75 of the signal: ITU-R BT.2408.
+fn hlg(l: f32) -> f32 {
+    let e = l * 0.265;
+    if e <= 1.0 / 12.0 {
+        (3.0 * e).sqrt()
+    } else {
+        0.178_832_77 * (12.0 * e - 0.284_668_92).ln() + 0.559_910_7
+    }
+}
+
 #[test]
-fn pixels_that_are_no_numbers_are_counted() {
+fn nonfinite_pixels_are_counted() {
     let folder = tempfile::tempdir().unwrap();
     let paths = ["a.exr", "b.exr"].map(|n| folder.path().join(n));
     for (k, path) in paths.iter().enumerate() {
@@ -543,7 +543,7 @@ fn pixels_that_are_no_numbers_are_counted() {
     }
     let recorded = splatvk::progress::Recorded::new(&Silent);
     let photos = photo::load_all(&paths, &recorded).unwrap();
-    let said = "b: 2 of its pixels are not finite numbers and are read as black";
-    assert_eq!(recorded.warnings(), [said]);
+    let warning = "b: 2 of its pixels are not finite numbers and are read as black";
+    assert_eq!(recorded.warnings(), [warning]);
     assert!(photos[1].image.at(3, 5)[1] == 0.0 && photos[1].image.at(4, 5) == [0.0; 3]);
 }

@@ -1,5 +1,5 @@
-//! The built-in adapters against graphs with the interfaces of public exports: each is run through
-//! the whole path of its role, and answers with something that shows what it was given.
+//! Runs the built-in adapters with small graphs that have the interfaces of public exports. Each
+//! graph goes through the whole code path of its task, and its outputs reveal its inputs.
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 use std::path::Path;
 
@@ -14,7 +14,7 @@ use splatvk_test_support::breakfast;
 use splatvk_test_support::onnx::{Attribute, FLOAT, INT64, Onnx};
 use splatvk_test_support::toys::{clip_in, photo};
 
-fn flat(width: usize, height: usize, colour: [f32; 3]) -> RgbImage {
+fn flat_photo(width: usize, height: usize, colour: [f32; 3]) -> RgbImage {
     RgbImage { width, height, data: vec![colour; width * height] }
 }
 
@@ -29,10 +29,10 @@ fn pool(side: i64) -> [(&'static str, Attribute<'static>); 2] {
     [("kernel_shape", Attribute::Ints(by)), ("strides", Attribute::Ints(by))]
 }
 
-/// Output `masks`: x of each prompt, plus the one number in `also`, plus 0, 100, 200… for the masks
-/// of a prompt. `shape` is that of one prompt's masks, 8 × 8 each; x is the first entry of the
-/// prompts' last axis.
-fn marked(graph: Onnx, points: &str, axis: i64, shape: &[u64], also: &str, masks: &str) -> Onnx {
+/// Adds output `masks`: the x of each prompt, plus the number in `also`, plus 0, 100, 200… for the
+/// masks of a prompt. `shape` is the shape of the 8 × 8 masks of one prompt; x is the first entry
+/// of the last axis of the prompts.
+fn with_masks(graph: Onnx, points: &str, axis: i64, shape: &[u64], also: &str, masks: &str) -> Onnx {
     let count = shape[shape.len() - 3];
     let place: Vec<f32> = (0..64 * count).map(|k| 100.0 * (k / 64) as f32).collect();
     let mut column: Vec<i64> = vec![1; shape.len()];
@@ -49,8 +49,8 @@ fn marked(graph: Onnx, points: &str, axis: i64, shape: &[u64], also: &str, masks
         .node("Add", "sum place", masks, &[])
 }
 
-/// Output `scores`: `values` for each prompt.
-fn scored(graph: Onnx, shape: &[u64], row: &[i64], values: &[f32], scores: &str) -> Onnx {
+/// Adds output `scores`: `values` for each prompt.
+fn with_scores(graph: Onnx, shape: &[u64], row: &[i64], values: &[f32], scores: &str) -> Onnx {
     graph
         .weight("values", shape, values)
         .weight("zero", &[1], &[0.0])
@@ -60,24 +60,24 @@ fn scored(graph: Onnx, shape: &[u64], row: &[i64], values: &[f32], scores: &str)
         .node("Add", "nothing values", scores, &[])
 }
 
-/// Asks a model about two pixels of a photo of 32 × 16: the first logit of each of their masks, and
+/// Prompts a model with two pixels of a photo of 32 × 16; returns the first logit of each mask, and
 /// the scores.
-fn asked(folder: &Path, name: &str) -> (Vec<f32>, Vec<f32>) {
+fn decode_prompts(folder: &Path, name: &str) -> (Vec<f32>, Vec<f32>) {
     let model = Registry::of(&[folder]).installed(Task::Masks, name).unwrap();
     let mut sam = Sam::load(&model).unwrap();
-    let encoded = sam.encode(&flat(32, 16, [0.485, 0.456, 0.406])).unwrap();
+    let encoded = sam.encode(&flat_photo(32, 16, [0.485, 0.456, 0.406])).unwrap();
     let found = sam.decode(&encoded, &[[8.0, 4.0], [24.0, 4.0]]).unwrap();
     assert_eq!((found.width, found.height, found.logits.len()), (8, 8, 2 * 3 * 64));
     (found.logits.iter().step_by(64).copied().collect(), found.scores)
 }
 
-fn near(given: &[f32], wanted: &[f32]) {
+fn assert_near(given: &[f32], wanted: &[f32]) {
     let close = given.len() == wanted.len() && given.iter().zip(wanted).all(|(a, b)| (a - b).abs() < 1e-3);
     assert!(close, "{given:?}, wanted {wanted:?}");
 }
 
 #[test]
-fn sam_2_hands_its_fine_features_to_the_decoder_and_fills_the_square() {
+fn sam2_passes_fine_features() {
     let dir = tempfile::tempdir().unwrap();
     Onnx::new()
         .input("image", FLOAT, "1 3 64 64")
@@ -101,26 +101,26 @@ fn sam_2_hands_its_fine_features_to_the_decoder_and_fills_the_square() {
         .output("masks", "labels 4 8 8")
         .output("iou_predictions", "labels 4")
         .node("ReduceMean", "high_res_feats_0", "mean", &[("keepdims", Attribute::Int(1))]);
-    let decoder = marked(decoder, "point_coords", 2, &[1, 4, 8, 8], "mean", "masks");
-    scored(decoder, &[1, 4], &[-1, 1], &[0.1, 0.2, 0.3, 0.4], "iou_predictions")
+    let decoder = with_masks(decoder, "point_coords", 2, &[1, 4, 8, 8], "mean", "masks");
+    with_scores(decoder, &[1, 4], &[-1, 1], &[0.1, 0.2, 0.3, 0.4], "iou_predictions")
         .write(&dir.path().join("sam2/decoder.onnx"));
-    let (logits, scores) = asked(dir.path(), "sam2");
+    let (logits, scores) = decode_prompts(dir.path(), "sam2");
     // Columns 8 and 24 of 32 are 16 and 48 of 64; a photo of the mean colour leaves 7 in the fine
     // features.
-    near(&logits, &[123.0, 223.0, 323.0, 155.0, 255.0, 355.0]);
-    near(&scores, &[0.2, 0.3, 0.4, 0.2, 0.3, 0.4]);
+    assert_near(&logits, &[123.0, 223.0, 323.0, 155.0, 255.0, 355.0]);
+    assert_near(&scores, &[0.2, 0.3, 0.4, 0.2, 0.3, 0.4]);
 
-    // A graph that leaves the padding point to its caller wants two.
+    // A graph that leaves the padding point to its caller needs two points.
     let adapter = "family = \"sam2\"\n[[graph]]\npart = \"mask-decoder\"\npads = false\n";
     std::fs::write(dir.path().join("sam2/adapter.toml"), adapter).unwrap();
     let mut sam = Sam::load(&Registry::of(&[dir.path()]).installed(Task::Masks, "sam2").unwrap()).unwrap();
-    let encoded = sam.encode(&flat(32, 16, [0.5; 3])).unwrap();
+    let encoded = sam.encode(&flat_photo(32, 16, [0.5; 3])).unwrap();
     let error = sam.decode(&encoded, &[[8.0, 4.0]]).err().unwrap().to_string();
     assert!(error.contains("point_") && error.contains("Expected: 1"), "{error}");
 }
 
 #[test]
-fn the_hugging_face_layout_of_sam_has_prompts_on_a_second_axis_and_a_table_of_positions() {
+fn sam_reads_hugging_face_layout() {
     let dir = tempfile::tempdir().unwrap();
     Onnx::new()
         .input("pixel_values", FLOAT, "batch 3 64 64")
@@ -142,18 +142,17 @@ fn the_hugging_face_layout_of_sam_has_prompts_on_a_second_axis_and_a_table_of_po
         .integers("one", &[1, 1, 1, 1, 1])
         .node("Slice", "image_positional_embeddings corner next", "first", &[])
         .node("Reshape", "first one", "position", &[]);
-    let decoder = marked(decoder, "input_points", 3, &[1, 1, 3, 8, 8], "position", "pred_masks");
-    scored(decoder, &[1, 1, 3], &[1, -1, 1], &[0.2, 0.3, 0.4], "iou_scores")
+    let decoder = with_masks(decoder, "input_points", 3, &[1, 1, 3, 8, 8], "position", "pred_masks");
+    with_scores(decoder, &[1, 1, 3], &[1, -1, 1], &[0.2, 0.3, 0.4], "iou_scores")
         .write(&dir.path().join("sam_hf/prompt_encoder_mask_decoder.onnx"));
-    let (logits, scores) = asked(dir.path(), "sam");
-    // The photo fills the upper half: a scale of 2 both ways.
-    near(&logits, &[21.0, 121.0, 221.0, 53.0, 153.0, 253.0]);
-    near(&scores, &[0.2, 0.3, 0.4, 0.2, 0.3, 0.4]);
+    let (logits, scores) = decode_prompts(dir.path(), "sam");
+    // The photo fills the upper half, at a scale of 2 in both directions.
+    assert_near(&logits, &[21.0, 121.0, 221.0, 53.0, 153.0, 253.0]);
+    assert_near(&scores, &[0.2, 0.3, 0.4, 0.2, 0.3, 0.4]);
 }
 
 #[test]
-fn an_encoder_with_preprocessing_inside_gets_bytes_as_rows_of_pixels_and_the_official_decoder_one_prompt_a_call()
- {
+fn sam_reads_official_layout() {
     let dir = tempfile::tempdir().unwrap();
     Onnx::new()
         .input("input_image", FLOAT, "height width 3")
@@ -177,16 +176,16 @@ fn an_encoder_with_preprocessing_inside_gets_bytes_as_rows_of_pixels_and_the_off
         .integers("second", &[1])
         .node("Slice", "point_coords p0 p1 second", "lone", &[])
         .node("Identity", "low_res_masks", "masks", &[]);
-    let decoder = marked(decoder, "lone", 2, &[1, 4, 8, 8], "image_embeddings", "low_res_masks");
-    scored(decoder, &[1, 4], &[-1, 1], &[0.1, 0.2, 0.3, 0.4], "iou_predictions")
+    let decoder = with_masks(decoder, "lone", 2, &[1, 4, 8, 8], "image_embeddings", "low_res_masks");
+    with_scores(decoder, &[1, 4], &[-1, 1], &[0.1, 0.2, 0.3, 0.4], "iou_predictions")
         .write(&dir.path().join("sam/decoder.onnx"));
-    let (logits, _) = asked(dir.path(), "sam");
+    let (logits, _) = decode_prompts(dir.path(), "sam");
     // The longer side becomes 1024: columns 256 and 768. 0.485 of 255 is 123.7.
-    near(&logits, &[479.675, 579.675, 679.675, 991.675, 1091.675, 1191.675]);
+    assert_near(&logits, &[479.675, 579.675, 679.675, 991.675, 1091.675, 1191.675]);
 }
 
 #[test]
-fn dense_features_are_averaged_over_regions() {
+fn lseg_averages_features_over_regions() {
     let dir = tempfile::tempdir().unwrap();
     clip_in(dir.path(), [0, 1, 2]);
     let (from, to) = (dir.path().join("clip_toy"), dir.path().join("lseg"));
@@ -205,7 +204,7 @@ fn dense_features_are_averaged_over_regions() {
         .write(&to.join("lseg.onnx"));
     let mut lseg =
         Clip::load(Registry::of(&[dir.path()]).installed(Task::Features, "lseg").unwrap()).unwrap();
-    let (mut image, mut labels) = (flat(32, 32, [0.5, 0.5, 1.0]), Image::filled(32, 32, 1));
+    let (mut image, mut labels) = (flat_photo(32, 32, [0.5, 0.5, 1.0]), Image::filled(32, 32, 1));
     for y in 0..32 {
         for x in 0..16 {
             // Half red, half green: their sum is the direction of the region.
@@ -215,17 +214,13 @@ fn dense_features_are_averaged_over_regions() {
     }
     let rows = lseg.embed_regions(&image, &labels, 2, &Silent).unwrap();
     let half = 0.5f32.sqrt();
-    near(&rows, &[half, half, 0.0, 0.0, 0.0, 1.0]);
+    assert_near(&rows, &[half, half, 0.0, 0.0, 0.0, 1.0]);
     let blue = lseg.embed_texts(&["blue"]).unwrap();
     assert!(blue[2] > 0.99, "{blue:?}");
 }
 
 #[test]
-fn roma_2_answers_both_directions_at_once_with_probabilities() {
-    let field = |shift: f32| -> Vec<f32> {
-        let place = |k: usize| (2.0 * (k as f32 + 0.5) / 8.0) - 1.0;
-        (0..64).flat_map(|k| [place(k % 8) + shift, place(k / 8)]).collect()
-    };
+fn roma2_returns_both_directions() {
     let dir = tempfile::tempdir().unwrap();
     Onnx::new()
         .input("img_A", FLOAT, "batch 3 64 64")
@@ -235,9 +230,9 @@ fn roma_2_answers_both_directions_at_once_with_probabilities() {
         .output("overlap_AB", "batch 8 8 1")
         .output("overlap_BA", "batch 8 8 1")
         .output("precision_AB", "batch 8 8 2 2")
-        .weight("there", &[1, 8, 8, 2], &field(0.5))
-        .weight("back", &[1, 8, 8, 2], &field(-0.5))
-        // A photo of white in [0, 1]: its mean says in which range it came.
+        .weight("there", &[1, 8, 8, 2], &warp_field(0.5))
+        .weight("back", &[1, 8, 8, 2], &warp_field(-0.5))
+        // The mean of a white photo reveals the value range of the input: [0, 1].
         .node("ReduceMean", "img_A", "white", &[("keepdims", Attribute::Int(1))])
         .weight("sure", &[1, 8, 8, 1], &[0.75; 64])
         .weight("unsure", &[1, 8, 8, 1], &[0.25; 64])
@@ -249,18 +244,24 @@ fn roma_2_answers_both_directions_at_once_with_probabilities() {
         .node("Identity", "precision", "precision_AB", &[])
         .write(&dir.path().join("romav2/warp.onnx"));
     let model = Registry::of(&[dir.path()]).installed(Task::Matcher, "romav2").unwrap();
-    let photos = [photo("a", flat(80, 40, [1.0; 3])), photo("b", flat(160, 100, [0.5; 3]))];
+    let photos = [photo("a", flat_photo(80, 40, [1.0; 3])), photo("b", flat_photo(160, 100, [0.5; 3]))];
     let (there, back) = &warp::warps(&model, &photos, &Silent).unwrap()[0];
     // A quarter of the width to the right, and back.
     let ([u, v], [s, t]) = (there.target.data[10 * 80 + 30], back.target.data[50 * 160 + 120]);
-    near(&[u, v, s, t], &[101.0, 26.25, 40.25, 20.2]);
-    near(&[there.certainty.data[10 * 80 + 30], back.certainty.data[50 * 160 + 120]], &[0.75, 0.25]);
+    assert_near(&[u, v, s, t], &[101.0, 26.25, 40.25, 20.2]);
+    assert_near(&[there.certainty.data[10 * 80 + 30], back.certainty.data[50 * 160 + 120]], &[0.75, 0.25]);
 }
 
-/// The breakfast views with a graph that returns their true depth and cameras, as VGGT says them
-/// and as Depth Anything 3 does.
+/// Pixel centres in [−1, 1] of a grid of 8 × 8, shifted to the right.
+fn warp_field(shift: f32) -> Vec<f32> {
+    let place = |k: usize| (2.0 * (k as f32 + 0.5) / 8.0) - 1.0;
+    (0..64).flat_map(|k| [place(k % 8) + shift, place(k / 8)]).collect()
+}
+
+/// Graphs that return the true depth and cameras of the breakfast views, in the formats of VGGT and
+/// of Depth Anything 3.
 #[test]
-fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
+fn true_pointmaps_give_true_cameras() {
     let views = breakfast::train_views();
     let n = views.len();
     let (w, h) = (112usize, 84);
@@ -284,27 +285,23 @@ fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
         }
     }
     let sure: Vec<f32> = depth.iter().map(|z| if *z > 0.0 { 5.0 } else { 1.0 }).collect();
-    let say = |graph: Onnx, name: &str, shape: &str, values: &[f32]| {
-        let dims: Vec<u64> = shape.split(' ').map(|d| d.parse().unwrap()).collect();
-        let kept = format!("the {name}").replace(' ', "_");
-        graph.output(name, shape).weight(&kept, &dims, values).node("Identity", &kept, name, &[])
-    };
     let narrow = |values: &[f64]| values.iter().map(|v| *v as f32).collect::<Vec<f32>>();
     let dir = tempfile::tempdir().unwrap();
     let graph = Onnx::new().input("images", FLOAT, &format!("1 {n} 3 {h} {w}"));
-    let graph = say(graph, "depth", &format!("1 {n} {h} {w} 1"), &depth);
-    let graph = say(graph, "depth_conf", &format!("1 {n} {h} {w}"), &sure);
-    say(graph, "pose_enc", &format!("1 {n} 9"), &narrow(&codes)).write(&dir.path().join("vggt/model.onnx"));
+    let graph = constant_output(graph, "depth", &format!("1 {n} {h} {w} 1"), &depth);
+    let graph = constant_output(graph, "depth_conf", &format!("1 {n} {h} {w}"), &sure);
+    constant_output(graph, "pose_enc", &format!("1 {n} 9"), &narrow(&codes))
+        .write(&dir.path().join("vggt/model.onnx"));
     let matrix_form = |folder: &str, intrinsics: &[f64]| {
         let graph = Onnx::new().input("image", FLOAT, &format!("1 {n} 3 {h} {w}"));
-        let graph = say(graph, "depth", &format!("1 {n} {h} {w}"), &depth);
-        let graph = say(graph, "depth_conf", &format!("1 {n} {h} {w}"), &sure);
-        let graph = say(graph, "extrinsics", &format!("1 {n} 3 4"), &narrow(&matrices));
-        let graph = say(graph, "intrinsics", &format!("1 {n} 3 3"), &narrow(intrinsics));
+        let graph = constant_output(graph, "depth", &format!("1 {n} {h} {w}"), &depth);
+        let graph = constant_output(graph, "depth_conf", &format!("1 {n} {h} {w}"), &sure);
+        let graph = constant_output(graph, "extrinsics", &format!("1 {n} 3 4"), &narrow(&matrices));
+        let graph = constant_output(graph, "intrinsics", &format!("1 {n} 3 3"), &narrow(intrinsics));
         graph.write(&dir.path().join(folder).join("model.onnx"));
     };
     matrix_form("da3", &intrinsics);
-    // The same cameras in pixels that are counted from their centres.
+    // The same cameras with pixel coordinates that count from pixel centres.
     let shifted = |(k, v): (usize, &f64)| if [2, 5].contains(&(k % 9)) { v - 0.5 } else { *v };
     matrix_form("da3_from_centres", &intrinsics.iter().enumerate().map(shifted).collect::<Vec<_>>());
     let adapter = "family = \"da3\"\n[[graph]]\npart = \"multi-view\"\npixel_centre = 0.0\n";
@@ -333,7 +330,7 @@ fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
             let turned = (camera.pose.rotation * truth.rotation.transpose()).transpose();
             let angle =
                 ((turned.x_axis.x + turned.y_axis.y + turned.z_axis.z - 1.0) / 2.0).clamp(-1.0, 1.0).acos();
-            // Depth is taken at one of 33 pixels and the nearest at that: measured below 0.1° and
+            // Depth is sampled at one of 33 pixels, at the nearest pixel: measured below 0.1° and
             // 0.3 %.
             assert!(angle.to_degrees() < 0.3, "{name} {k}: {}°", angle.to_degrees());
             assert!(
@@ -346,4 +343,11 @@ fn multi_view_networks_that_say_the_truth_give_the_true_cameras() {
         let few = pairs::pointmaps(&model, &photos[..2], &Silent).unwrap_err().to_string();
         assert!(few.contains(&format!("exported for {n} photos, here are 2")), "{few}");
     }
+}
+
+/// Adds an output with constant values.
+fn constant_output(graph: Onnx, name: &str, shape: &str, values: &[f32]) -> Onnx {
+    let dims: Vec<u64> = shape.split(' ').map(|d| d.parse().unwrap()).collect();
+    let kept = format!("the {name}").replace(' ', "_");
+    graph.output(name, shape).weight(&kept, &dims, values).node("Identity", &kept, name, &[])
 }

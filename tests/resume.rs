@@ -1,5 +1,5 @@
-//! A run that is killed, or finds the disk full, goes on with `--resume`, and ends with the same
-//! bits as one that was left alone.
+//! A run that is killed, or finds the disk full, continues with `--resume` and ends with the same
+//! bits as an uninterrupted run.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used)] // a panic is how a test fails
 mod fixture;
@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Times that the run is killed. `tools/test-long` asks for 20.
+/// Number of times that the run is killed; `tools/test-long` sets 20.
 const KILLS: &str = "SPLATVK_TEST_KILLS";
 
 /// Photos of a size at which a run takes seconds.
@@ -29,7 +29,7 @@ impl Scene {
             let small = photo.resize_exact(240, 180, image::imageops::FilterType::Triangle);
             small.to_rgb8().save(photos.join(format!("{k}.png"))).unwrap();
         }
-        // Beside photos a film is not read, which every run warns of.
+        // A film beside photos is not read; every run warns of it.
         std::fs::write(photos.join("clip.mp4"), "film").unwrap();
         Scene { folder }
     }
@@ -38,7 +38,7 @@ impl Scene {
         self.folder.path().join(name)
     }
 
-    /// A folder like the one that set-up fills, without stages.
+    /// Folder like the one that setup fills, without stages.
     fn home(&self, name: &str) -> PathBuf {
         let home = self.at(name);
         if !home.exists() {
@@ -77,16 +77,16 @@ impl Scene {
         command
     }
 
-    /// Runs to the end; what it said.
+    /// Runs to the end and returns the messages.
     fn finished(&self, home: &str, out: &str, language: u32, resume: bool) -> String {
         let output = self.run(home, out, language, resume).stderr(Stdio::piped()).output().unwrap();
-        let said = String::from_utf8(output.stderr).unwrap();
-        assert!(output.status.success(), "{said}");
-        said
+        let log = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success(), "{log}");
+        log
     }
 }
 
-/// Everything of a scene that does not tell the time.
+/// All files of a scene except those that contain times.
 fn content(scene: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let mut files = Vec::new();
     let mut folders = vec![scene.to_path_buf()];
@@ -104,14 +104,14 @@ fn content(scene: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     files
 }
 
-/// What a scene's run.json says of the photos, the cameras and the answers.
+/// Statistics in a scene's run.json about the photos, the cameras and the answers.
 fn statistics(scene: &Path) -> Value {
     let run: Value = serde_json::from_slice(&std::fs::read(scene.join("run.json")).unwrap()).unwrap();
     let part = |name: &str| run["statistics"][name].clone();
     serde_json::json!([part("geometry"), part("light"), part("psnr_train"), part("queries"), run["warnings"]])
 }
 
-/// Kills a child as a power cut would, unless it has ended by itself before; whether it has.
+/// Kills a child as a power cut would. Returns false if it had already ended.
 fn killed_after(mut child: Child, time: Duration) -> bool {
     let began = Instant::now();
     while began.elapsed() < time {
@@ -126,7 +126,7 @@ fn killed_after(mut child: Child, time: Duration) -> bool {
     false
 }
 
-/// Size of the largest file below a folder, bytes.
+/// Size of the largest file in a folder, bytes.
 fn largest(folder: &Path) -> u64 {
     let entries = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
     entries.map(|p| if p.is_dir() { largest(&p) } else { p.metadata().unwrap().len() }).max().unwrap_or(0)
@@ -134,13 +134,13 @@ fn largest(folder: &Path) -> u64 {
 
 #[test]
 #[ignore = "three whole runs; unit tests of pipeline and format::workspace fill disks faster"]
-fn a_run_that_no_disk_takes_leaves_the_old_scene_and_goes_on_later() {
+fn full_disk_run_resumes_later() {
     let scene = Scene::new();
     scene.finished("home-a", "whole", 20, false);
     let before = content(&scene.at("whole"));
     let run_json = std::fs::read(scene.at("whole/run.json")).unwrap();
 
-    // The same run again, over its scene, where the largest file of the scene does not fit; the
+    // The same run again, over its own scene, with too little space for the largest file. The
     // kernel counts in blocks of 512 bytes, and would end the process without the trap.
     let blocks = largest(&scene.at("whole")).div_ceil(512) - 2;
     let mut run = scene.run("home-b", "whole", 20, false);
@@ -148,11 +148,11 @@ fn a_run_that_no_disk_takes_leaves_the_old_scene_and_goes_on_later() {
     if memory_was_limited(output.status) {
         return;
     }
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(2), "{said}");
-    let last: Value = serde_json::from_str(said.lines().last().unwrap()).unwrap();
+    let log = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{log}");
+    let last: Value = serde_json::from_str(log.lines().last().unwrap()).unwrap();
     let message = last["message"].as_str().unwrap();
-    assert!(last["event"] == "error" && message.contains("cannot be written"), "{said}");
+    assert!(last["event"] == "error" && message.contains("cannot be written"), "{log}");
     assert!(message.contains("ulimit") && message.lines().count() == 1, "{message}");
     assert!(content(&scene.at("whole")) == before, "the old scene is as it was");
     assert!(std::fs::read(scene.at("whole/run.json")).unwrap() == run_json);
@@ -161,9 +161,9 @@ fn a_run_that_no_disk_takes_leaves_the_old_scene_and_goes_on_later() {
         assert!(!name.contains("partial") && !name.contains("old"), "left behind: {name}");
     }
 
-    // There is space again.
-    let said = scene.finished("home-b", "resumed", 20, true);
-    let kept = said.lines().find(|l| l.contains("kept from an earlier run")).unwrap();
+    // With enough space again.
+    let log = scene.finished("home-b", "resumed", 20, true);
+    let kept = log.lines().find(|l| l.contains("kept from an earlier run")).unwrap();
     // The trained language is larger than the limit, so it was not kept.
     assert!(
         kept.contains("cameras") && kept.contains("view dependence") && kept.contains("alignment"),
@@ -174,7 +174,7 @@ fn a_run_that_no_disk_takes_leaves_the_old_scene_and_goes_on_later() {
 
 #[test]
 #[ignore = "takes long: tools/test-long"]
-fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
+fn killed_run_resumes_with_same_bits() {
     let scene = Scene::new();
     let began = Instant::now();
     scene.finished("home-a", "whole", 20, false);
@@ -205,18 +205,18 @@ fn a_killed_run_goes_on_and_ends_with_the_same_bits() {
     assert_eq!(statistics(&whole), statistics(&resumed));
     assert!(statistics(&whole)[4].to_string().contains("clip.mp4"), "{}", statistics(&whole)[4]);
 
-    // Everything is there: nothing but decoding runs again. Then another late option: what precedes
-    // it stays.
-    let said = scene.finished("home-b", "again", 20, true);
-    let kept = |said: &str| said.lines().find(|l| l.contains("kept from an earlier run")).unwrap().to_owned();
+    // With all stages kept, only decoding runs again; then another late option, with all earlier
+    // stages kept.
+    let log = scene.finished("home-b", "again", 20, true);
+    let kept = |log: &str| log.lines().find(|l| l.contains("kept from an earlier run")).unwrap().to_owned();
     // Splats are read as the stage after them left them.
     for stage in ["cameras", "depth", "view dependence", "alignment", "language"] {
-        assert!(kept(&said).contains(stage), "{stage}: {said}");
+        assert!(kept(&log).contains(stage), "{stage}: {log}");
     }
-    assert!(!said.contains("\"begin\",\"stage\":\"rgb"), "{said}");
+    assert!(!log.contains("\"begin\",\"stage\":\"rgb"), "{log}");
     assert!(content(&scene.at("again")) == b, "the same scene");
-    let said = scene.finished("home-b", "other", 10, true);
-    let kept = kept(&said);
+    let log = scene.finished("home-b", "other", 10, true);
+    let kept = kept(&log);
     assert!(kept.contains("view dependence") && kept.contains("alignment"), "{kept}");
     assert!(!kept.contains("language"), "{kept}");
 }

@@ -1,5 +1,5 @@
 //! Every shipped shader module, in all variants: naga parses and validates it, and the reflection
-//! agrees with itself.
+//! is consistent.
 #![allow(clippy::unwrap_used)] // helpers of tests
 use naga::front::spv;
 use naga::valid::{Capabilities, ValidationFlags, Validator};
@@ -50,19 +50,21 @@ fn reflection_is_complete_and_unambiguous() {
 }
 
 #[test]
-fn access_follows_from_the_code() {
-    let access = |family: &str, name: &str| {
-        let family = shaders::FAMILIES.iter().find(|f| f.name == family).unwrap();
-        let binding = family.modules[0].bindings.iter().find(|b| b.name == name).unwrap();
-        (binding.access.read, binding.access.write)
-    };
+fn access_follows_from_code() {
     assert_eq!(access("gather", "from"), (true, false));
     assert_eq!(access("gather", "to"), (false, true));
     assert_eq!(access("scan_lanes", "sums"), (true, true));
     assert_eq!(access("raster_backward", "projected_grad"), (true, true));
 }
 
-/// What a block of a module holds: a scalar's name, or the bytes of a structure.
+/// Whether the first module of a family reads and writes a binding.
+fn access(family: &str, name: &str) -> (bool, bool) {
+    let family = shaders::FAMILIES.iter().find(|f| f.name == family).unwrap();
+    let binding = family.modules[0].bindings.iter().find(|b| b.name == name).unwrap();
+    (binding.access.read, binding.access.write)
+}
+
+/// Element type of a block of a module: the name of a scalar, or the size of a structure.
 fn element_of(module: &naga::Module, block: naga::Handle<naga::Type>) -> String {
     use naga::{ScalarKind, TypeInner};
     let TypeInner::Struct { members, .. } = &module.types[block].inner else { return "no block".to_owned() };
@@ -86,10 +88,9 @@ fn element_of(module: &naga::Module, block: naga::Handle<naga::Type>) -> String 
     }
 }
 
-/// `Binding::element` and the type of the field in `Bindings` are written by build.rs from one
-/// value.
+/// build.rs writes `Binding::element` and the type of the field in `Bindings` from one value.
 #[test]
-fn elements_are_what_the_modules_read() {
+fn binding_elements_match_modules() {
     let structures = [
         ("CameraView", size_of::<shaders::structs::CameraView>()),
         ("SourceView", size_of::<shaders::structs::SourceView>()),
@@ -103,7 +104,7 @@ fn elements_are_what_the_modules_read() {
             let found = element_of(&parsed, variable.ty);
             let structure = structures.iter().find(|s| s.0 == binding.element);
             let expected = structure.map_or(binding.element.to_owned(), |s| format!("{} bytes", s.1));
-            // Without native float atomics, the bits of floats.
+            // Without native float atomics, a buffer contains the bits of floats.
             let bits =
                 module.float_atomics == Some(false) && (binding.element, found.as_str()) == ("f32", "u32");
             assert!(found == expected || bits, "{}: `{}` holds {found}", module.name, binding.name);
@@ -113,7 +114,7 @@ fn elements_are_what_the_modules_read() {
     assert_eq!(kinds.into_iter().collect::<Vec<_>>(), ["CameraView", "SourceView", "f32", "i32", "u32"]);
 }
 
-/// Every `const NAME: TYPE = VALUE;` of the Rust sources.
+/// Collects every `const NAME: TYPE = VALUE;` of the Rust sources.
 fn rust_constants(folder: &std::path::Path, found: &mut Vec<(String, String, String)>) {
     for entry in std::fs::read_dir(folder).unwrap() {
         let path = entry.unwrap().path();
@@ -132,14 +133,14 @@ fn rust_constants(folder: &std::path::Path, found: &mut Vec<(String, String, Str
     }
 }
 
-/// The numbers in a Rust value; none if it names anything.
+/// Numbers in a Rust value; empty if it contains names.
 fn literals(value: &str) -> Vec<f64> {
     let parts = value.split(['[', ']', ',', ' ']).filter(|p| !p.is_empty());
     parts.map(|p| p.replace('_', "").parse()).collect::<Result<_, _>>().unwrap_or_default()
 }
 
 #[test]
-fn constants_of_shaders_stand_in_one_place() {
+fn shader_constants_stand_in_one_place() {
     let (mut rust, mut repeated) = (Vec::new(), Vec::new());
     ["src", "crates"].iter().for_each(|folder| rust_constants(std::path::Path::new(folder), &mut rust));
     assert!(rust.len() > 100 && shaders::CONSTANTS.len() > 20);
@@ -161,10 +162,10 @@ fn constants_of_shaders_stand_in_one_place() {
 }
 
 #[test]
-fn constants_are_what_the_sources_say() {
+fn constants_match_sources() {
     use shaders::shared::{cutoffs, layout, plane_sweep, ssim};
     assert_eq!((layout::TILE, shaders::sort_sweep::TILE, shaders::decode::PIXELS), (8, 2048, 4));
-    // A workgroup's part of a row is whole strips, each of which has a sum.
+    // A workgroup covers whole strips of a row, each of which has a sum.
     assert_eq!(shaders::ssim_rows_shared::SPAN % ssim::STRIP, 0);
     assert_eq!((layout::BASE_CHANNELS, layout::PROJECTED_FLOATS, layout::CAMERA_GRADIENTS), (4, 12, 10));
     // Moments and base channels fit their vectors, without one to spare.

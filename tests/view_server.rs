@@ -1,5 +1,5 @@
-//! The server of `splatvk view`, as what else runs on the machine meets it: other pages, other
-//! users, requests that never end.
+//! The server of `splatvk view` with other clients on the machine: other pages, other users,
+//! requests that never end.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
@@ -11,7 +11,7 @@ use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-/// One scene for all tests, in the target folder: nothing destroys statics.
+/// One scene for all tests, in the target folder: statics are never dropped.
 fn scene() -> &'static PathBuf {
     static SCENE: OnceLock<PathBuf> = OnceLock::new();
     SCENE.get_or_init(|| {
@@ -22,8 +22,8 @@ fn scene() -> &'static PathBuf {
     })
 }
 
-/// An ordinary request gets its answer, soon.
-fn answers(server: &Server) {
+/// Expects a prompt answer to an ordinary request.
+fn assert_answers(server: &Server) {
     let clock = Instant::now();
     let (status, body) = server.request("POST", "query", "", &json!({ "text": "lemon" }).to_string());
     assert_eq!(status, 200, "{body}");
@@ -32,7 +32,7 @@ fn answers(server: &Server) {
 }
 
 #[test]
-fn only_its_own_page_is_answered() {
+fn server_answers_only_own_page() {
     let server = Server::start(scene());
     let port = server.host.split_once(':').unwrap().1;
     for name in ["", "scene.bin", "query", "none"] {
@@ -62,7 +62,7 @@ fn only_its_own_page_is_answered() {
     assert_eq!(server.request("GET", "", &format!("Host: localhost:{port}\r\n"), "").0, 200);
     assert_eq!(server.request("GET", "../Cargo.toml", "", "").0, 404);
     assert_eq!(server.request("DELETE", "", "", "").0, 404);
-    // HEAD says what GET would, without the body.
+    // HEAD replies with the headers of GET, without the body.
     for name in ["", "scene.bin", "none"] {
         let (status, body) = server.request("GET", name, "", "");
         let reply = server
@@ -70,7 +70,7 @@ fn only_its_own_page_is_answered() {
         let (head, nothing) = reply.split_once("\r\n\r\n").unwrap();
         assert!(head.starts_with(&format!("HTTP/1.1 {status} ")) && nothing.is_empty(), "{reply}");
         let length = head.to_lowercase();
-        // Of the scene the body is no text, and its length here is not that of its bytes.
+        // The body of the scene is no text, and its length here is not that of its bytes.
         assert!(name == "scene.bin" || length.contains(&format!("content-length: {}", body.len())), "{head}");
     }
     assert_eq!(server.request("POST", "query", "", "lemon").0, 400);
@@ -82,9 +82,9 @@ fn only_its_own_page_is_answered() {
     assert_eq!((&answer["level"], &answer["codes"], &answer["found"]), (&json!(2), &json!([6]), &json!(2)));
 }
 
-/// Other users of the machine can connect; the address is what they do not know.
+/// Other users of the machine can connect, but they lack the address.
 #[test]
-fn without_the_secret_there_is_nothing() {
+fn server_needs_secret_path() {
     let (server, other) = (Server::start(scene()), Server::start(scene()));
     let secret = server.base.trim_matches('/');
     assert!(secret.len() == 32 && secret.bytes().all(|b| b.is_ascii_hexdigit()), "{secret}");
@@ -104,9 +104,9 @@ fn without_the_secret_there_is_nothing() {
     assert_eq!(server.request("GET", "scene.bin", "", "").0, 200);
 }
 
-/// What a page sends back must not become a page itself.
+/// An answer to a page must not be interpreted as a page.
 #[test]
-fn answers_are_data_whatever_was_asked() {
+fn server_answers_are_data() {
     let server = Server::start(scene());
     let body = json!({ "text": "<script>alert(1)</script>" }).to_string();
     let head = format!("POST {}query HTTP/1.1\r\nHost: {}\r\n", server.base, server.host);
@@ -120,7 +120,7 @@ fn answers_are_data_whatever_was_asked() {
 }
 
 #[test]
-fn bodies_that_are_huge_or_never_end_stop_nobody() {
+fn server_refuses_huge_and_endless_bodies() {
     let server = Server::start(scene());
     let head = format!("POST {}query HTTP/1.1\r\nHost: {}\r\n", server.base, server.host);
     let too_long = |rest: String| {
@@ -130,7 +130,7 @@ fn bodies_that_are_huge_or_never_end_stop_nobody() {
     too_long("Content-Length: 99999999999999\r\n\r\n".into());
     too_long(format!("Content-Length: 5000\r\n\r\n{}", "x".repeat(5000)));
     too_long(format!("Transfer-Encoding: chunked\r\n\r\n1388\r\n{}\r\n0\r\n\r\n", "x".repeat(5000)));
-    // Not even for a path that has nothing to do with a body.
+    // Not even for a path without a body.
     let reply = server.raw(
         format!("POST / HTTP/1.1\r\nHost: {}\r\nContent-Length: 99999999999999\r\n\r\n", server.host)
             .as_bytes(),
@@ -147,18 +147,18 @@ fn bodies_that_are_huge_or_never_end_stop_nobody() {
     .iter()
     .map(|bytes| server.open(bytes.as_bytes()))
     .collect();
-    answers(&server);
+    assert_answers(&server);
     for mut stream in unfinished {
-        // Ended by the server, with or without a word.
+        // Ended by the server, with or without a reply.
         let _ = std::io::Read::read_to_end(&mut stream, &mut Vec::new());
     }
     let took = begun.elapsed();
     assert!(took > Duration::from_secs(3) && took < Duration::from_secs(15), "{took:?}");
-    answers(&server);
+    assert_answers(&server);
 }
 
 #[test]
-fn malformed_requests_are_refused_and_leave_it_answering() {
+fn server_survives_malformed_requests() {
     let server = Server::start(scene());
     let big = format!("GET / HTTP/1.1\r\nHost: {}\r\nX: {}\r\n\r\n", server.host, "x".repeat(100_000));
     let many: String = (0..5000).map(|k| format!("X-{k}: 1\r\n")).collect();
@@ -175,20 +175,20 @@ fn malformed_requests_are_refused_and_leave_it_answering() {
         let reply = server.raw(&bytes);
         assert!(reply.is_empty() || reply.starts_with("HTTP/1.1 4"), "{reply}");
     }
-    answers(&server);
+    assert_answers(&server);
 }
 
-/// More than the server keeps open: it must end those that say nothing, and go on.
+/// More connections than the server keeps open: it must close idle ones, and continue.
 #[test]
-fn a_thousand_connections_leave_it_answering_and_ending() {
+fn server_survives_thousand_connections() {
     let server = Server::start(scene());
     let half = format!("POST {}query HTTP/1.1\r\nHost: {}\r\n", server.base, server.host);
     let body = format!("{half}Content-Length: 2000\r\n\r\n{{");
     let kinds = [String::new(), half, body];
     let open: Vec<TcpStream> = (0..1000).map(|k| server.open(kinds[k % 3].as_bytes())).collect();
-    answers(&server);
+    assert_answers(&server);
     drop(open);
-    // And a thousand that are in order, eight at a time.
+    // Then a thousand complete requests, eight at a time.
     std::thread::scope(|scope| {
         for _ in 0..8 {
             scope.spawn(|| {
@@ -204,9 +204,9 @@ fn a_thousand_connections_leave_it_answering_and_ending() {
     assert!(took < Duration::from_secs(2), "{took:?}");
 }
 
-/// Names in a scene lead to pictures of the scene, and nowhere else.
+/// Names in a scene lead only to pictures of the scene.
 #[test]
-fn pictures_outside_of_the_scene_are_not_shown() {
+fn server_shows_only_scene_pictures() {
     let folder = tempfile::tempdir().unwrap();
     let scene = breakfast(folder.path());
     let shows = || Server::start(&scene).request("GET", "", "", "").1.contains("data:image/jpeg");
@@ -228,7 +228,7 @@ fn pictures_outside_of_the_scene_are_not_shown() {
 }
 
 #[test]
-fn stopping_twice_is_no_failure_either() {
+fn server_stops_twice_without_failure() {
     let server = Server::start(scene());
     let id = server.child.id().to_string();
     let mut server = server;
@@ -239,7 +239,7 @@ fn stopping_twice_is_no_failure_either() {
 }
 
 #[test]
-fn it_ends_with_its_terminal_and_with_who_started_it() {
+fn server_ends_with_parent() {
     for signal in ["-HUP", "-INT", "-TERM"] {
         let server = Server::start(scene());
         let _open = server.open(b"POST / HT");
@@ -251,23 +251,23 @@ fn it_ends_with_its_terminal_and_with_who_started_it() {
         return;
     }
     let mut server = Server::start_with(scene(), Stdio::piped());
-    answers(&server);
+    assert_answers(&server);
     assert!(server.child.try_wait().unwrap().is_none());
     drop(server.child.stdin.take());
     let closed = Instant::now();
     assert_eq!(server.child.wait().unwrap().code(), Some(0));
     assert!(closed.elapsed() < Duration::from_secs(2));
-    // Nobody to watch: closed from the beginning.
+    // A pipe without a reader: closed from the beginning.
     let (reader, writer) = std::io::pipe().unwrap();
     drop(writer);
     let mut server = Server::start_with(scene(), reader.into());
     std::thread::sleep(Duration::from_millis(500));
     assert!(server.child.try_wait().unwrap().is_none());
-    answers(&server);
+    assert_answers(&server);
 }
 
 #[test]
-fn a_port_that_is_taken_is_said() {
+fn server_reports_taken_port() {
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let port = taken.local_addr().unwrap().port().to_string();
     let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));

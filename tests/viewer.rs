@@ -1,5 +1,5 @@
-//! The interactive view in a real browser: it draws what the engine draws, selects what is clicked,
-//! lights up what is asked for, and asks nobody but its own server.
+//! The interactive view in a real browser: it draws the pictures of the engine, selects the clicked
+//! object, highlights the answer to a query, and connects to no other server.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod browser;
 mod fixture;
@@ -26,19 +26,12 @@ fn to_float(picture: &image::RgbImage) -> RgbImage {
     RgbImage { width: picture.width() as usize, height: picture.height() as usize, data }
 }
 
-/// A place inside the object's mask that is farthest from its edge, in pixels of the photo.
-fn inside(mask: &Image<i32>, object: i32) -> (f64, f64) {
-    let clear = |x: usize, y: usize, r: usize| {
-        x >= r
-            && y >= r
-            && x + r < mask.width
-            && y + r < mask.height
-            && (y - r..=y + r).all(|j| (x - r..=x + r).all(|i| mask.at(i, j) == object))
-    };
+/// The point of the object's mask farthest from its edge, in pixels of the photo.
+fn inner_point(mask: &Image<i32>, object: i32) -> (f64, f64) {
     let mut best = (0, 0, 0);
     for y in 0..mask.height {
         for x in 0..mask.width {
-            while clear(x, y, best.2 + 1) {
+            while is_clear(mask, object, x, y, best.2 + 1) {
                 best = (x, y, best.2 + 1);
             }
         }
@@ -46,9 +39,18 @@ fn inside(mask: &Image<i32>, object: i32) -> (f64, f64) {
     (best.0 as f64 + 0.5, best.1 as f64 + 0.5)
 }
 
-/// Pixels that a relevancy picture colours: what does not answer is grey.
+/// Whether a square of radius `r` lies inside the object.
+fn is_clear(mask: &Image<i32>, object: i32, x: usize, y: usize, r: usize) -> bool {
+    x >= r
+        && y >= r
+        && x + r < mask.width
+        && y + r < mask.height
+        && (y - r..=y + r).all(|j| (x - r..=x + r).all(|i| mask.at(i, j) == object))
+}
+
+/// Pixels that a relevancy picture colours; the others are grey.
 fn coloured(picture: &image::RgbImage) -> Vec<bool> {
-    // Warm and light colours of the heat differ by more than half the range between channels.
+    // Warm and light colours of the heat map differ by more than half the range between channels.
     picture.pixels().map(|p| p.0.iter().max().unwrap() - p.0.iter().min().unwrap() > 100).collect()
 }
 
@@ -57,23 +59,23 @@ fn iou(a: &[bool], b: &[bool]) -> f64 {
     both as f64 / a.iter().zip(b).filter(|(a, b)| **a || **b).count() as f64
 }
 
-fn is(mask: &Image<i32>, object: i32) -> Vec<bool> {
+fn object_mask(mask: &Image<i32>, object: i32) -> Vec<bool> {
     mask.data.iter().map(|l| *l == object).collect()
 }
 
 #[test]
-fn the_served_view_draws_selects_and_answers() {
+fn served_view_draws_and_answers() {
     let folder = tempfile::tempdir().unwrap();
     let scene = breakfast(folder.path());
     let Some(chromium) = browser::installed() else { return };
     let server = Server::start(&scene);
     let mut page = Page::open(&chromium, 720, 540, false);
     page.go(&server.address);
-    draws_what_the_engine_draws(&mut page, &scene);
-    a_click_selects_the_object(&mut page);
-    a_query_lights_it_up(&mut page);
-    the_keyboard_does_it_all(&mut page);
-    a_tape_measures_between_two_clicks(&mut page, &scene);
+    check_drawing(&mut page, &scene);
+    check_selection(&mut page);
+    check_query(&mut page);
+    check_keyboard(&mut page);
+    check_tape(&mut page, &scene);
     assert_eq!(page.complaints, Vec::<String>::new());
     let foreign: Vec<_> = page
         .requests
@@ -81,23 +83,23 @@ fn the_served_view_draws_selects_and_answers() {
         .filter(|r| !r.starts_with(&server.address) && !r.starts_with("data:") && !r.starts_with("blob:"))
         .collect();
     assert!(foreign.is_empty(), "{foreign:?}");
-    keep(&mut page, "desktop.png");
+    keep_screenshot(&mut page, "desktop.png");
     drop(page);
     let mut phone = Page::open(&chromium, 390, 844, true);
     phone.go(&server.address);
-    fits_a_phone(&mut phone);
+    check_phone_layout(&mut phone);
     let (status, _) = server.stop("-INT");
     assert_eq!(status.code(), Some(0), "Ctrl-C is how it ends");
 }
 
-/// Keeps a screenshot to look at where `SPLATVK_KEEP` names a folder.
-fn keep(page: &mut Page, name: &str) {
+/// Keeps a screenshot for inspection if `SPLATVK_KEEP` names a folder.
+fn keep_screenshot(page: &mut Page, name: &str) {
     if let Ok(folder) = std::env::var("SPLATVK_KEEP") {
         std::fs::write(Path::new(&folder).join(name), page.screenshot()).unwrap();
     }
 }
 
-fn draws_what_the_engine_draws(page: &mut Page, scene: &Path) {
+fn check_drawing(page: &mut Page, scene: &Path) {
     let loaded = scene_dir::load(scene).unwrap();
     let device = gpu::open(None).unwrap();
     let mut viewer = Viewer::new(&device, &loaded.splats, &LanguageField::default()).unwrap();
@@ -105,37 +107,37 @@ fn draws_what_the_engine_draws(page: &mut Page, scene: &Path) {
         let engine = viewer.view(camera).unwrap().rendered;
         let likeness = psnr(&to_float(&page.picture(i)), &engine.rgb);
         println!("view {i}: {likeness:.1} dB against splatvk render");
-        // What bytes and half floats cost; 25 dB would show a wrong blend.
+        // Loss by bytes and half floats; a wrong blend would be 25 dB.
         assert!(likeness > 38.0, "view {i}: {likeness} dB");
     }
     page.run("splatvk.show('depth')");
     let depth = to_float(&page.picture(0));
     let engine =
         splatvk::report::colour::depth_image(&viewer.view(&loaded.cameras[0]).unwrap().rendered.depth);
-    // The page takes the range of depth from the splats, the engine from the pixels: the same
-    // picture, not the same shades.
+    // The page takes the range of depth from the splats, the engine from the pixels: the pictures
+    // have the same shapes in other shades.
     assert!(psnr(&depth, &engine) > 15.0, "{}", psnr(&depth, &engine));
     page.run("splatvk.show('colour')");
 }
 
-/// Where a pixel of photo 0 is on a page whose canvas fills the window.
-fn on_page(page: &mut Page, (x, y): (f64, f64)) -> (f64, f64) {
+/// Position of a pixel of photo 0 on a page whose canvas fills the window.
+fn page_position(page: &mut Page, (x, y): (f64, f64)) -> (f64, f64) {
     let size = page.run("[innerWidth, innerHeight]");
     let (width, height) = (size[0].as_f64().unwrap(), size[1].as_f64().unwrap());
     let scale = (width / 640.0).min(height / 480.0);
     (width / 2.0 + (x - 320.0) * scale, height / 2.0 + (y - 240.0) * scale)
 }
 
-fn a_click_selects_the_object(page: &mut Page) {
+fn check_selection(page: &mut Page) {
     page.run("splatvk.goTo(0)");
     let mask = masks_of("train_00");
     let mut clicked = 0;
     for object in 1..=LABELS as i32 {
-        // A carpet behind the table shows as a few slivers.
-        if is(&mask, object).iter().filter(|m| **m).count() < 2000 {
+        // A carpet behind the table is visible as a few slivers.
+        if object_mask(&mask, object).iter().filter(|m| **m).count() < 2000 {
             continue;
         }
-        let (x, y) = on_page(page, inside(&mask, object));
+        let (x, y) = page_position(page, inner_point(&mask, object));
         if page.run(&format!("document.elementFromPoint({x}, {y}).tagName")) != "CANVAS" {
             continue;
         }
@@ -146,11 +148,11 @@ fn a_click_selects_the_object(page: &mut Page) {
         assert_eq!(page.run("document.querySelector('.v-card h3').textContent"), name);
         clicked += 1;
         if object == 9 {
-            keep(page, "selected.png");
+            keep_screenshot(page, "selected.png");
         }
     }
     assert!(clicked >= 6, "only {clicked} objects are free of controls");
-    // On the finer level, which counts backwards.
+    // On the finer level; the numbers of levels count backwards.
     page.run("document.querySelector('.v-levels button').click()");
     let selected = page.run("splatvk.state.selected");
     assert_eq!(selected["level"], 0);
@@ -159,7 +161,7 @@ fn a_click_selects_the_object(page: &mut Page) {
     assert_eq!(page.run("splatvk.state.selected"), Value::Null);
 }
 
-fn a_query_lights_it_up(page: &mut Page) {
+fn check_query(page: &mut Page) {
     page.press("/");
     page.write("blue mug");
     page.press("Enter");
@@ -167,12 +169,12 @@ fn a_query_lights_it_up(page: &mut Page) {
     assert_eq!(page.run(answered), json!([8]));
     assert_eq!(page.run("splatvk.state.mode"), "relevancy");
     for (view, stem) in ["train_00", "train_02"].iter().enumerate() {
-        let overlap = iou(&coloured(&page.picture(view)), &is(&masks_of(stem), 9));
+        let overlap = iou(&coloured(&page.picture(view)), &object_mask(&masks_of(stem), 9));
         println!("blue mug in {stem}: IoU {overlap:.2}");
         assert!(overlap > 0.7, "{stem}: {overlap}");
     }
-    keep(page, "query.png");
-    // What the scene has no words for is said, and nothing else changes.
+    keep_screenshot(page, "query.png");
+    // A word without an embedding is reported, and nothing else changes.
     page.run("splatvk.ask('unicorn')");
     assert!(
         page.run("document.querySelector('.v-status').textContent").as_str().unwrap().contains("unicorn")
@@ -183,7 +185,7 @@ fn a_query_lights_it_up(page: &mut Page) {
     page.run("document.querySelector('.viewer').focus()");
 }
 
-fn the_keyboard_does_it_all(page: &mut Page) {
+fn check_keyboard(page: &mut Page) {
     page.press("Escape");
     assert_eq!(page.run("splatvk.state.mode"), "colour");
     for mode in ["depth", "level", "level", "colour"] {
@@ -193,7 +195,7 @@ fn the_keyboard_does_it_all(page: &mut Page) {
     page.press("m");
     page.press("m");
     page.run("splatvk.settled()");
-    keep(page, "levels.png");
+    keep_screenshot(page, "levels.png");
     page.run("splatvk.show('colour')");
     let eye = |page: &mut Page| page.run("splatvk.camera().position");
     page.run("splatvk.goTo(0)");
@@ -221,7 +223,7 @@ fn the_keyboard_does_it_all(page: &mut Page) {
     assert_eq!(page.run("document.querySelector('.v-help').hidden"), true);
 }
 
-fn a_tape_measures_between_two_clicks(page: &mut Page, scene: &Path) {
+fn check_tape(page: &mut Page, scene: &Path) {
     page.run("splatvk.show('colour')");
     page.run("splatvk.goTo(0)");
     page.press("l");
@@ -229,13 +231,13 @@ fn a_tape_measures_between_two_clicks(page: &mut Page, scene: &Path) {
     let (camera, masks) = (&loaded.cameras[0], masks_of("train_00"));
     let depth = npy::read_npz(data("breakfast/depth/train_00.npz")).unwrap()["depth"].to_f32();
     // The middle of the box of cereal and of the blue mug.
-    let ends = [4, 9].map(|object| inside(&masks, object));
+    let ends = [4, 9].map(|object| inner_point(&masks, object));
     let places = ends.map(|(x, y)| {
         let z = f64::from(depth[y as usize * 640 + x as usize]);
         camera.unproject(glam::DVec2::new(x, y), z)
     });
     for end in ends {
-        let (x, y) = on_page(page, end);
+        let (x, y) = page_position(page, end);
         page.click(x, y);
     }
     let units = page.run("splatvk.tape.units").as_f64().unwrap();
@@ -244,14 +246,10 @@ fn a_tape_measures_between_two_clicks(page: &mut Page, scene: &Path) {
     // Splats of four pixels about the true surface.
     assert!((units / truth - 1.0).abs() < 0.05, "{units} {truth}");
     assert_eq!(page.run("splatvk.state.selected"), Value::Null, "a click measures, it does not select");
-    let shown = |page: &mut Page| {
-        let text = page.run("document.querySelector('.v-tape output').textContent");
-        text.as_str().unwrap().to_owned()
-    };
-    assert!(shown(page).ends_with(" units"), "{}", shown(page));
+    assert!(tape_text(page).ends_with(" units"), "{}", tape_text(page));
     page.run("splatvk.settled()");
     assert_eq!(page.run("document.querySelectorAll('.v-line line, .v-line circle').length"), 3);
-    keep(page, "measured.png");
+    keep_screenshot(page, "measured.png");
     page.run("document.querySelector('.v-tape input').focus()");
     page.write("0.5");
     let stated = page.run("splatvk.tape.stated()");
@@ -261,18 +259,23 @@ fn a_tape_measures_between_two_clicks(page: &mut Page, scene: &Path) {
     let measured = &metric::measure(&loaded, std::slice::from_ref(&length), None).unwrap()[0];
     assert!((measured.units / units - 1.0).abs() < 1e-4);
     assert_eq!(length.metres, Some(0.5));
-    // From now on the page tells lengths in metres.
+    // From now on the page shows lengths in metres.
     page.run("document.querySelector('.viewer').focus()");
     for end in ends {
-        let (x, y) = on_page(page, end);
+        let (x, y) = page_position(page, end);
         page.click(x, y);
     }
-    assert_eq!(shown(page), "50 cm");
+    assert_eq!(tape_text(page), "50 cm");
     page.press("Escape");
     assert_eq!(page.run("document.querySelector('.v-tape').hidden"), true);
 }
 
-fn fits_a_phone(page: &mut Page) {
+fn tape_text(page: &mut Page) -> String {
+    let text = page.run("document.querySelector('.v-tape output').textContent");
+    text.as_str().unwrap().to_owned()
+}
+
+fn check_phone_layout(page: &mut Page) {
     page.run("splatvk.ask('lemon')");
     let outside = page.run(
         "[...document.querySelectorAll('.v-ask, .v-card, .v-tools button, .v-modes, .v-photos')].filter((e) => { \
@@ -285,10 +288,10 @@ fn fits_a_phone(page: &mut Page) {
          e.getBoundingClientRect().height < 38).length",
     );
     assert_eq!(small, 0, "too small for a finger");
-    keep(page, "phone.png");
+    keep_screenshot(page, "phone.png");
     page.press("Escape");
     page.run("splatvk.goTo(0)");
-    let (x, y) = on_page(page, inside(&masks_of("train_00"), 4));
+    let (x, y) = page_position(page, inner_point(&masks_of("train_00"), 4));
     let point = json!([{ "x": x, "y": y }]);
     page.call("Input.dispatchTouchEvent", json!({ "type": "touchStart", "touchPoints": point }));
     page.call("Input.dispatchTouchEvent", json!({ "type": "touchEnd", "touchPoints": [] }));
@@ -298,7 +301,7 @@ fn fits_a_phone(page: &mut Page) {
 }
 
 #[test]
-fn a_static_page_answers_what_was_asked() {
+fn static_page_answers_stored_queries() {
     let Some(chromium) = browser::installed() else { return };
     let folder = tempfile::tempdir().unwrap();
     let scene = scene_dir::load(&breakfast(folder.path())).unwrap();
@@ -340,11 +343,11 @@ fn a_static_page_answers_what_was_asked() {
     let mut page = Page::open(&chromium, 800, 600, false);
     page.go(&format!("file://{}", file.display()));
     page.run("splatvk.ask('loaf of bread')");
-    let overlap = iou(&coloured(&page.picture(0)), &is(&masks_of("train_00"), 8));
+    let overlap = iou(&coloured(&page.picture(0)), &object_mask(&masks_of("train_00"), 8));
     println!("loaf of bread: IoU {overlap:.2}");
     assert!(overlap > 0.7, "{overlap}");
     page.run("splatvk.show('unseen')");
-    let overlap = iou(&coloured(&page.picture(0)), &is(&masks_of("train_00"), 8));
+    let overlap = iou(&coloured(&page.picture(0)), &object_mask(&masks_of("train_00"), 8));
     println!("guessed: IoU {overlap:.2}");
     assert!(overlap > 0.7, "what no photo shows is in magenta, the rest grey: {overlap}");
     page.run("splatvk.ask('plate')");
@@ -365,7 +368,7 @@ fn a_static_page_answers_what_was_asked() {
 }
 
 #[test]
-fn the_report_of_a_training_shows_its_scene() {
+fn training_report_shows_scene() {
     let Some(chromium) = browser::installed() else { return };
     let scene = fixture::scene();
     let mut page = Page::open(&chromium, 800, 600, false);
@@ -380,7 +383,7 @@ fn the_report_of_a_training_shows_its_scene() {
         page.requests.iter().filter(|r| !r.starts_with("file:") && !r.starts_with("data:")).count(),
         0
     );
-    keep(&mut page, "report.png");
+    keep_screenshot(&mut page, "report.png");
 }
 
 /// The pictures of the README, from a real run: `SPLATVK_SCENE=out/breakfast cargo test --test
@@ -403,37 +406,37 @@ fn pictures_of_a_real_scene() {
     let masks = masks_of("train_00");
     page.run("splatvk.goTo(0)");
     for (object, word) in [(7, "lemon"), (9, "mug"), (4, "cereal"), (8, "loaf")] {
-        let (x, y) = on_page(&mut page, inside(&masks, object));
+        let (x, y) = page_position(&mut page, inner_point(&masks, object));
         page.click(x, y);
         let names = page.run(
             "[...document.querySelectorAll('.v-names li')].map((l) => l.firstChild.textContent).join(', ')",
         );
         println!("a click on {word}: {} = {names}", page.run("splatvk.state.selected"));
     }
-    let (x, y) = on_page(&mut page, inside(&masks, 9));
+    let (x, y) = page_position(&mut page, inner_point(&masks, 9));
     page.click(x, y);
     let shots = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/images");
-    let shoot = |page: &mut Page, name: &str, width: u32| {
+    let save_picture = |page: &mut Page, name: &str, width: u32| {
         let shot = image::load_from_memory(&page.screenshot()).unwrap().to_rgb8();
         let height = shot.height() * width / shot.width();
         let small = image::imageops::resize(&shot, width, height, image::imageops::FilterType::Lanczos3);
         let file = std::fs::File::create(shots.join(name)).unwrap();
         image::codecs::jpeg::JpegEncoder::new_with_quality(file, 85).encode_image(&small).unwrap();
     };
-    shoot(&mut page, "view-select.jpg", 840);
+    save_picture(&mut page, "view-select.jpg", 840);
     for (text, object) in [("lemon", 7), ("blue mug", 9), ("box of cereal", 4), ("loaf of bread", 8)] {
         page.run(&format!("splatvk.ask('{text}')"));
-        let overlap = iou(&coloured(&page.picture(0)), &is(&masks, object));
+        let overlap = iou(&coloured(&page.picture(0)), &object_mask(&masks, object));
         println!("{text}: IoU {overlap:.2} in photo 0");
         page.run("splatvk.settled()");
     }
     page.run("splatvk.ask('blue mug')");
-    shoot(&mut page, "view-query.jpg", 840);
+    save_picture(&mut page, "view-query.jpg", 840);
     drop(page);
     let mut phone = Page::open(&chromium, 390, 844, true);
     phone.go(&server.address);
     phone.run("splatvk.ask('lemon')");
-    shoot(&mut phone, "view-phone.jpg", 390);
+    save_picture(&mut phone, "view-phone.jpg", 390);
     phone.run("splatvk.show('level', 2)");
-    keep(&mut phone, "phone-level.png");
+    keep_screenshot(&mut phone, "phone-level.png");
 }

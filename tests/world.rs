@@ -1,5 +1,5 @@
-//! What the program does with what a scene knows of the world: which way is up, how long things
-//! are, what the photos show.
+//! Commands that use the world data of a scene: the up direction, lengths, and visibility in
+//! photos.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
@@ -10,8 +10,8 @@ use splatvk::scene::{
 };
 use std::path::{Path, PathBuf};
 
-/// A scene of two splats and one camera, the first splat one unit straight above it and in no
-/// photo. Points are where splats are.
+/// A scene of two splats and one camera; the first splat lies one unit straight above the camera,
+/// in no photo. Points are at the splats' means.
 fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
     let scene = folder.join("scene");
     std::fs::create_dir(&scene).unwrap();
@@ -65,7 +65,7 @@ fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
 }
 
 #[test]
-fn exports_turn_up_to_the_axis_that_is_asked_for() {
+fn export_up_turns_scene() {
     let folder = tempfile::tempdir().unwrap();
     let (scene, splats, camera) = tilted_scene(folder.path());
     let export = |scene: &Path, format: &str, axis: &str, name: &str| {
@@ -89,7 +89,7 @@ fn exports_turn_up_to_the_axis_that_is_asked_for() {
         let points = splatvk::format::colmap::read_points(&folder.path().join("model")).unwrap().positions;
         assert!((mean(&points[0]) - to).length() < 1e-6, "and points: {points:?}");
     }
-    // Read back, glTF is in the axes of scenes again: y up in the file.
+    // After reading, a glTF scene is in the axes of scenes again: y up in the file.
     assert!(export(&scene, "glb", "y", "a.glb").output().unwrap().status.success());
     let turned = splatvk::format::gaussians::read(&folder.path().join("a.glb")).unwrap().0;
     assert!((mean(&turned.means[0]) - glam::DVec3::NEG_Y).length() < 1e-6);
@@ -100,7 +100,7 @@ fn exports_turn_up_to_the_axis_that_is_asked_for() {
 }
 
 #[test]
-fn splats_that_no_photo_shows_are_left_out_with_their_language() {
+fn only_seen_export_omits_unseen() {
     let folder = tempfile::tempdir().unwrap();
     let (scene, out) = (tilted_scene(folder.path()).0, folder.path().join("seen.spz"));
     let mut export = splatvk();
@@ -112,19 +112,9 @@ fn splats_that_no_photo_shows_are_left_out_with_their_language() {
 }
 
 #[test]
-fn a_known_length_gives_the_scene_its_scale() {
+fn measure_scale_sets_metres() {
     let folder = tempfile::tempdir().unwrap();
     let (scene, splats, _) = tilted_scene(folder.path());
-    let measure = |arguments: &[&str]| {
-        let mut measure = splatvk();
-        measure.arg("measure").arg(&scene).args(arguments);
-        measure
-    };
-    let json = |arguments: &[&str]| -> serde_json::Value {
-        let output = measure(&[&["--json"], arguments].concat()).output().unwrap();
-        assert!(output.status.success(), "{}", text(&output.stderr));
-        serde_json::from_slice(&output.stdout).unwrap()
-    };
     let export = |name: &str| {
         let mut export = splatvk();
         export
@@ -136,13 +126,13 @@ fn a_known_length_gives_the_scene_its_scale() {
     };
     refuses(&mut export("none.ply"), 2, &["scale is not known", "splatvk measure --scale"]);
     let length = "0,0,1 - 0.3,-0.4,1";
-    let before = json(&[length]);
+    let before = measure_json(&scene, &[length]);
     assert!(
         (before["lengths"][0]["units"].as_f64().unwrap() - 0.5).abs() < 1e-12 && before["scale"].is_null()
     );
-    let stated = json(&["--scale", "0,0,2 - -2,0,2 = 50cm", length]);
+    let stated = measure_json(&scene, &["--scale", "0,0,2 - -2,0,2 = 50cm", length]);
     assert!((stated["scale"]["metres_per_unit"].as_f64().unwrap() - 0.25).abs() < 1e-12);
-    let kept = json(&[length]);
+    let kept = measure_json(&scene, &[length]);
     assert!((kept["lengths"][0]["metres"].as_f64().unwrap() - 0.125).abs() < 1e-12, "{kept}");
     assert!(kept["lengths"][0]["sigma_metres"].as_f64().unwrap() > 0.0);
     assert!(export("metres.ply").output().unwrap().status.success());
@@ -150,15 +140,27 @@ fn a_known_length_gives_the_scene_its_scale() {
     for (own, metres) in splats.means.as_flattened().iter().zip(scaled.means.as_flattened()) {
         assert!((0.25 * own - metres).abs() < 1e-6);
     }
-    // The direction up and all else that the manifest says stays.
+    // The up direction and all else in the manifest stays.
     let loaded = scene_dir::load(&scene).unwrap();
     assert!(loaded.world.up.is_some() && loaded.splats == splats && loaded.cameras.len() == 1);
-    let behind = json(&["--", "-0.3,0,1 - 0,0,1"]);
+    let behind = measure_json(&scene, &["--", "-0.3,0,1 - 0,0,1"]);
     assert!((behind["lengths"][0]["units"].as_f64().unwrap() - 0.3).abs() < 1e-12);
-    refuses(&mut measure(&[]), 2, &["give a length"]);
-    refuses(&mut measure(&["--scale", length]), 2, &["METRES"]);
-    refuses(&mut measure(&["0,0,1 to 1,0,1"]), 2, &["A - B"]);
-    refuses(&mut measure(&["0,0,1 - 0,0,1"]), 2, &["one place"]);
-    refuses(&mut measure(&["b:1,1 - a:2,2"]), 2, &["no view of the scene", "it has a"]);
-    refuses(&mut measure(&["a:64,1 - a:2,2"]), 2, &["64 × 48 pixels"]);
+    refuses(&mut measure(&scene, &[]), 2, &["give a length"]);
+    refuses(&mut measure(&scene, &["--scale", length]), 2, &["METRES"]);
+    refuses(&mut measure(&scene, &["0,0,1 to 1,0,1"]), 2, &["A - B"]);
+    refuses(&mut measure(&scene, &["0,0,1 - 0,0,1"]), 2, &["one place"]);
+    refuses(&mut measure(&scene, &["b:1,1 - a:2,2"]), 2, &["no view of the scene", "it has a"]);
+    refuses(&mut measure(&scene, &["a:64,1 - a:2,2"]), 2, &["64 × 48 pixels"]);
+}
+
+fn measure_json(scene: &Path, arguments: &[&str]) -> serde_json::Value {
+    let output = measure(&scene, &[&["--json"], arguments].concat()).output().unwrap();
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+fn measure(scene: &Path, arguments: &[&str]) -> std::process::Command {
+    let mut measure = splatvk();
+    measure.arg("measure").arg(scene).args(arguments);
+    measure
 }

@@ -7,13 +7,13 @@ use std::process::{Child, ChildStdin, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-/// Software rendering on two busy cores may take its time.
+/// Software rendering on two busy cores is slow.
 const TIMEOUT: Duration = Duration::from_secs(90);
 
-/// Where Debian, Ubuntu, Fedora and Google put it; `CHROMIUM` overrides.
+/// Usual names in Debian, Ubuntu, Fedora and from Google; `CHROMIUM` overrides.
 const NAMES: [&str; 4] = ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
 
-/// A Chromium on this machine, or `None` with a line that says what the test would need.
+/// A Chromium on this machine; otherwise `None`, and a line that names the missing program.
 pub fn installed() -> Option<String> {
     let named = std::env::var("CHROMIUM").ok();
     let runs = |name: &String| Command::new(name).arg("--version").output().is_ok_and(|o| o.status.success());
@@ -24,22 +24,22 @@ pub fn installed() -> Option<String> {
     found
 }
 
-/// One page of a browser that ends with this value.
+/// One page of a browser, which ends when this value is dropped.
 pub struct Page {
     child: Child,
     to: ChildStdin,
     from: Receiver<Value>,
     session: String,
     next: u64,
-    /// What the page logged as warning or error, or threw.
+    /// Warnings and errors that the page logged, and exceptions.
     pub complaints: Vec<String>,
-    /// Addresses that the page asked for.
+    /// URLs that the page requested.
     pub requests: Vec<String>,
     _profile: tempfile::TempDir,
 }
 
 impl Page {
-    /// Opens an empty page of a window of this size, CSS pixels; `phone` adds touch.
+    /// Opens an empty page in a window of this size, CSS pixels; `phone` adds touch.
     pub fn open(program: &str, width: u32, height: u32, phone: bool) -> Page {
         let profile = tempfile::tempdir().unwrap();
         // The browser reads commands from descriptor 3 and writes to 4: here its standard input and
@@ -52,7 +52,7 @@ impl Page {
                 "--no-first-run",
                 "--no-default-browser-check",
             ])
-            // As root, and in containers, Chromium's own sandbox does not start; the page is ours.
+            // Chromium's sandbox does not start as root or in containers; the page is trusted.
             .args(["--no-sandbox", "--disable-dev-shm-usage", "--hide-scrollbars", "--mute-audio"])
             .args(["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-watchdog"])
             .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
@@ -127,7 +127,7 @@ impl Page {
             "Runtime.consoleAPICalled" if params["type"] == "error" || params["type"] == "warning" => {
                 self.complaints.push(params["args"].to_string());
             }
-            // Software rendering is slow, which the driver remarks on.
+            // Software rendering is slow, about which the driver warns.
             "Log.entryAdded" if !params["entry"]["text"].as_str().unwrap_or("").contains("GPU stall") => {
                 self.complaints.push(params["entry"].to_string());
             }
@@ -138,7 +138,7 @@ impl Page {
         }
     }
 
-    /// Goes to an address and waits until the view is ready.
+    /// Navigates to a URL and waits until the view is ready.
     pub fn go(&mut self, url: &str) {
         self.call("Page.navigate", json!({ "url": url }));
         let start = Instant::now();
@@ -149,7 +149,7 @@ impl Page {
         self.run("splatvk.ready.then(() => splatvk.settled())");
     }
 
-    /// The value of an expression; promises are waited for.
+    /// Value of an expression; promises are awaited.
     pub fn run(&mut self, expression: &str) -> Value {
         let params = json!({ "expression": expression, "awaitPromise": true, "returnByValue": true });
         let result = self.call("Runtime.evaluate", params);
@@ -157,7 +157,7 @@ impl Page {
         result["result"]["value"].clone()
     }
 
-    /// A real click of the mouse, CSS pixels of the page.
+    /// Clicks the mouse, CSS pixels of the page.
     pub fn click(&mut self, x: f64, y: f64) {
         for kind in ["mousePressed", "mouseReleased"] {
             let params =
@@ -167,7 +167,7 @@ impl Page {
         self.run("splatvk.settled()");
     }
 
-    /// Presses and lets go of a key.
+    /// Presses and releases a key.
     pub fn press(&mut self, key: &str) {
         let mut params = json!({ "type": "keyDown", "key": key });
         if key.chars().count() == 1 {
@@ -180,18 +180,18 @@ impl Page {
         self.call("Input.dispatchKeyEvent", json!({ "type": "keyUp", "key": key }));
     }
 
-    /// Types a text where the focus is.
+    /// Types a text into the focused element.
     pub fn write(&mut self, text: &str) {
         self.call("Input.insertText", json!({ "text": text }));
     }
 
-    /// What is on the screen, PNG.
+    /// The screen as PNG.
     pub fn screenshot(&mut self) -> Vec<u8> {
         let shot = self.call("Page.captureScreenshot", json!({ "format": "png" }));
         decoded(shot["data"].as_str().unwrap())
     }
 
-    /// The view's picture from a photo's camera, at the photo's size.
+    /// The view rendered from a photo's camera, at the photo's size.
     pub fn picture(&mut self, view: usize) -> image::RgbImage {
         let url = self.run(&format!(
             "splatvk.picture({view}).then((blob) => new Promise((done) => {{ const r = new FileReader(); \

@@ -1,4 +1,4 @@
-//! One file: what goes wrong on networks and disks.
+//! Download of one file: failures of networks and disks.
 use super::server::{File, Request, Server, plain};
 use super::sha256;
 use splatvk::Error;
@@ -10,7 +10,7 @@ use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Short enough for tests.
+/// Limits short enough for tests.
 const LIMITS: Limits = Limits {
     connect: Duration::from_secs(5),
     stall: Duration::from_millis(300),
@@ -18,7 +18,7 @@ const LIMITS: Limits = Limits {
     pause: Duration::from_millis(10),
 };
 
-/// Where the file of a test is, as the catalogue would say it; the server stands for the host.
+/// URL of the test's file in the catalogue; the server replaces the host.
 const FROM: &str = "https://models.example/some/file.bin";
 
 fn content(length: usize) -> Vec<u8> {
@@ -53,7 +53,7 @@ impl Trial {
         client.download(&self.source, 10_000_000, self.folder.path(), &to, &Silent)
     }
 
-    /// The whole file is there, and nothing half.
+    /// Expects the whole file and no partial one.
     fn got(&self, content: &[u8]) -> Fetched {
         let done = self.get().unwrap();
         assert!(std::fs::read(self.path("whole.bin")).unwrap() == content, "another content");
@@ -62,7 +62,7 @@ impl Trial {
         done
     }
 
-    /// The one line of a download that must fail.
+    /// Expects a failure; returns its one line.
     fn fails(&self, words: &[&str]) -> String {
         let text = self.get().unwrap_err().to_string();
         assert!(words.iter().all(|w| text.contains(w)) && !text.contains('\n'), "{words:?}: {text}");
@@ -72,7 +72,7 @@ impl Trial {
 }
 
 #[test]
-fn redirects_are_followed_to_the_file_and_not_in_circles() {
+fn download_follows_redirects_without_loops() {
     let body = content(300_000);
     let file = File::new(&body);
     let trial = Trial::new(move |r, _, s| match r.path.as_str() {
@@ -88,7 +88,7 @@ fn redirects_are_followed_to_the_file_and_not_in_circles() {
 }
 
 #[test]
-fn what_is_gone_is_said_at_once_and_a_busy_server_is_asked_again() {
+fn download_retries_busy_but_not_missing() {
     let gone = Trial::new(|_, _, s| plain(s, "404 Not Found", &[]));
     gone.fails(&["HTTP 404", "no longer there", "models path"]);
     assert_eq!(gone.server.requests().len(), 1);
@@ -105,23 +105,23 @@ fn what_is_gone_is_said_at_once_and_a_busy_server_is_asked_again() {
     busy.got(&body);
     let never = Trial::new(|_, _, s| plain(s, "503 Service Unavailable", &[]));
     never.fails(&["HTTP 503", "3 times"]);
-    // Nobody answers at all.
+    // No server at all.
     let mut nobody = Trial::new(|_, _, _| ());
     nobody.server.address = "http://127.0.0.1:9".into();
     nobody.fails(&["no answer", "3 times", "check the network"]);
 }
 
 #[test]
-fn a_download_that_breaks_off_goes_on_where_it_was() {
+fn download_resumes_after_break() {
     let body = content(900_000);
     let file = File::new(&body);
-    // Five pieces, which is more tries than are allowed without progress.
+    // Five pieces: more attempts than are permitted without progress.
     let trial = Trial::new(move |r, _, s| file.clone().cut(200_000).send(r, s));
     trial.got(&body);
     let asked: Vec<_> = trial.server.requests().iter().map(Request::first).collect();
     assert_eq!(asked, [None, Some(200_000), Some(400_000), Some(600_000), Some(800_000)]);
 
-    // Another process goes on as well, and proves that it is the same file.
+    // Another process continues, too, and proves that it is the same file.
     let file = File::new(&body);
     let trial = Trial::new(move |r, count, s| match count {
         0..3 => file.clone().cut(if count == 0 { 500_000 } else { 0 }).send(r, s),
@@ -135,9 +135,9 @@ fn a_download_that_breaks_off_goes_on_where_it_was() {
 }
 
 #[test]
-fn pieces_of_different_files_are_never_put_together() {
+fn download_never_mixes_files() {
     let (old, new) = (content(600_000), content(700_000).into_iter().rev().collect::<Vec<_>>());
-    // The file has changed in between, with an ETag that says so.
+    // The file changed in between, with a new ETag.
     let (first, second) = (File::new(&old), File { etag: "\"two\"", ..File::new(&new) });
     let changed = Trial::new(move |r, count, s| match count {
         0 => first.clone().cut(300_000).send(r, s),
@@ -146,7 +146,7 @@ fn pieces_of_different_files_are_never_put_together() {
     changed.got(&new);
     assert_eq!(changed.server.requests()[1].first(), Some(300_000), "it was asked to go on");
 
-    // A weak ETag does not say that every byte is the same: nothing is put to what came under one.
+    // A weak ETag does not guarantee equal bytes: a partial file under one is not continued.
     let file = File { etag: "W/\"one\"", ..File::new(&old) };
     let weak = Trial::new(move |r, count, s| match count {
         0 => file.clone().cut(300_000).send(r, s),
@@ -155,7 +155,7 @@ fn pieces_of_different_files_are_never_put_together() {
     weak.got(&old);
     assert_eq!(weak.server.requests()[1].first(), None, "it was asked for all of it");
 
-    // A server that knows no ranges sends all of it again.
+    // A server without ranges sends the whole file again.
     let file = File { ranges: false, ..File::new(&old) };
     let whole = Trial::new(move |r, count, s| match count {
         0 => file.clone().cut(300_000).send(r, s),
@@ -163,7 +163,7 @@ fn pieces_of_different_files_are_never_put_together() {
     });
     whole.got(&old);
 
-    // One that answers with another part than the one asked for.
+    // A server that responds with another range than the requested one.
     let file = File::new(&old);
     let odd = Trial::new(move |r, count, s| match (count, r.first()) {
         (0, _) => file.clone().cut(300_000).send(r, s),
@@ -172,7 +172,8 @@ fn pieces_of_different_files_are_never_put_together() {
     });
     odd.got(&old);
 
-    // One whose ETag lies: the checksum of the catalogue tells, and it starts from the first byte.
+    // A server with a wrong ETag: the checksum of the catalogue detects it, and the download
+    // restarts from the first byte.
     let file = File::new(&new);
     let lying = Trial::new(move |r, _, s| file.send(r, s)).pinned(&new);
     std::fs::write(lying.path("file.bin.partial"), [1; 1000]).unwrap();
@@ -184,7 +185,7 @@ fn pieces_of_different_files_are_never_put_together() {
 }
 
 #[test]
-fn a_file_of_another_content_or_size_is_refused_and_not_kept() {
+fn download_refuses_wrong_content() {
     let (body, other) = (content(100_000), content(100_001));
     let file = File::new(&other);
     let larger = Trial::new(move |r, _, s| file.send(r, s)).pinned(&body);
@@ -198,37 +199,40 @@ fn a_file_of_another_content_or_size_is_refused_and_not_kept() {
     assert!(!wrong.path("file.bin.partial").exists());
     assert_eq!(wrong.server.requests().len(), 1);
 
-    // A web page in its place.
+    // A web page instead of the file.
     let page = Trial::new(|_, _, s| {
         let _ = s.write_all(b"HTTP/1.1 200 OK\r\nContent-Type: text/html\r\nContent-Length: 6\r\n\r\nlog in");
     });
     page.fails(&["a web page came"]);
-    // Without a length: only the catalogue tells that it is not all.
-    let half = |_: &Request, _: usize, s: &mut TcpStream| {
-        let _ = s
-            .write_all(b"HTTP/1.1 200 OK\r\nConnection: close\r\n\r\n")
-            .and_then(|()| s.write_all(&[7; 1000]));
-    };
-    Trial::new(half).pinned(&body).fails(&["ended after 1000 bytes", "3 times"]);
-    // Without a length, and without an end.
-    let endless = |_: &Request, _: usize, s: &mut TcpStream| {
-        let _ = s.write_all(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n");
-        while write!(s, "10000\r\n")
-            .and_then(|()| s.write_all(&[7; 0x10000]))
-            .and_then(|()| s.write_all(b"\r\n"))
-            .is_ok()
-        {}
-    };
-    Trial::new(endless).pinned(&body).fails(&["longer than it can be (0.1 MB)"]);
-    let unknown = Trial::new(endless);
+    // Without a length: only the catalogue reveals that the file is incomplete.
+    Trial::new(send_part).pinned(&body).fails(&["ended after 1000 bytes", "3 times"]);
+    // Without a length or an end.
+    Trial::new(send_endlessly).pinned(&body).fails(&["longer than it can be (0.1 MB)"]);
+    let unknown = Trial::new(send_endlessly);
     unknown.fails(&["longer than it can be (10.0 MB)"]);
     assert!(!unknown.path("file.bin.partial").exists());
     let huge = File::new(&content(10_000_001));
     Trial::new(move |r, _, s| huge.send(r, s)).fails(&["longer than it can be"]);
 }
 
+/// Sends chunks until the client closes the connection.
+fn send_endlessly(_: &Request, _: usize, s: &mut TcpStream) {
+    let _ = s.write_all(b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n");
+    while write!(s, "10000\r\n")
+        .and_then(|()| s.write_all(&[7; 0x10000]))
+        .and_then(|()| s.write_all(b"\r\n"))
+        .is_ok()
+    {}
+}
+
+/// Sends 1000 bytes of content and closes the connection.
+fn send_part(_: &Request, _: usize, s: &mut TcpStream) {
+    let _ =
+        s.write_all(b"HTTP/1.1 200 OK\r\nConnection: close\r\n\r\n").and_then(|()| s.write_all(&[7; 1000]));
+}
+
 #[test]
-fn a_silent_server_is_left_and_asked_again() {
+fn download_retries_silent_server() {
     let body = content(600_000);
     let file = File::new(&body);
     let trial = Trial::new(move |r, count, s| match count {
@@ -244,7 +248,7 @@ fn a_silent_server_is_left_and_asked_again() {
     trial.got(&body);
     assert!(began.elapsed() < Duration::from_secs(2), "waited for {:?}", began.elapsed());
     assert_eq!(trial.server.requests()[2].first(), Some(1 << 18));
-    // Slow is not silent.
+    // Slow is not stalled.
     let file = File { pause: Duration::from_millis(150), ..File::new(&body) };
     let slow = Trial::new(move |r, _, s| file.send(r, s));
     slow.got(&body);
@@ -252,7 +256,7 @@ fn a_silent_server_is_left_and_asked_again() {
 }
 
 #[test]
-fn a_full_disk_is_named_and_a_file_that_is_there_is_not_downloaded_again() {
+fn download_names_full_disk() {
     let body = content(500_000);
     let file = File::new(&body);
     let trial = Trial::new(move |r, _, s| file.send(r, s));
@@ -271,7 +275,7 @@ fn a_full_disk_is_named_and_a_file_that_is_there_is_not_downloaded_again() {
     std::fs::rename(trial.path("whole.bin"), trial.path("file.bin.partial")).unwrap();
     assert_eq!(trial.got(&body).downloaded, 0);
     assert!(trial.server.requests().is_empty());
-    // Somebody changed it meanwhile.
+    // The file was changed meanwhile.
     std::fs::write(trial.path("whole.bin"), b"something else").unwrap();
     assert_eq!(trial.got(&body).downloaded, 500_000);
 }

@@ -1,5 +1,5 @@
-//! The open pack at its real sizes: graphs with the interfaces of the public files, filled up with
-//! weights that nothing reads.
+//! The open pack at its real sizes: graphs with the interfaces of the public files, padded with
+//! unused weights.
 use super::models::clip_graphs;
 use super::server::{File, Server, plain};
 use splatvk::fetch::{Client, Limits, fetch};
@@ -10,11 +10,11 @@ use splatvk::progress::Silent;
 use splatvk_test_support::onnx::{Attribute, FLOAT, Onnx};
 use std::collections::HashMap;
 
-/// Bytes of the two files without a size in the catalogue: 393.0 MiB of weights, the tokenizer of
-/// CLIP.
+/// Bytes of the weights without a size in the catalogue: 393.0 MiB. The tokenizer of CLIP has none
+/// either.
 const DA3_WEIGHTS: u64 = 412_090_368;
 
-/// No two bytes alike for long, as in weights.
+/// Incompressible numbers, as in weights.
 fn noise(count: u64) -> Vec<f32> {
     let mut state = 1u64;
     let mut next = || {
@@ -24,13 +24,13 @@ fn noise(count: u64) -> Vec<f32> {
     (0..count).map(|_| next()).collect()
 }
 
-/// Fills a graph up to about `bytes`.
+/// Pads a graph to about `bytes`.
 fn filled(graph: Onnx, bytes: u64) -> Vec<u8> {
     let count = bytes / 4;
     graph.weight("unused", &[count], &noise(count)).encode()
 }
 
-/// A graph whose outputs are these constants.
+/// A graph with constant outputs.
 fn saying(mut graph: Onnx, outputs: &[(&str, &str, f32)]) -> Onnx {
     for (name, shape, value) in outputs {
         let dims: Vec<u64> = shape.split(' ').map(|d| d.parse().unwrap()).collect();
@@ -52,14 +52,16 @@ fn da3() -> Onnx {
         "model.onnx_data",
     );
     let graph = saying(graph, &[("predicted_depth", "1 2 28 28", 2.0), ("confidence", "1 2 28 28", 5.0)]);
-    let matrices = |name: &str, shape: &str, dims: &[u64], one: &[f32], graph: Onnx| {
-        let kept = format!("the_{name}");
-        graph.output(name, shape).weight(&kept, dims, &one.repeat(2)).node("Identity", &kept, name, &[])
-    };
     let pose = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
-    let graph = matrices("extrinsics", "1 2 3 4", &[1, 2, 3, 4], &pose, graph);
+    let graph = two_matrices("extrinsics", "1 2 3 4", &[1, 2, 3, 4], &pose, graph);
     let camera = [30.0, 0.0, 14.0, 0.0, 30.0, 14.0, 0.0, 0.0, 1.0];
-    matrices("intrinsics", "1 2 3 3", &[1, 2, 3, 3], &camera, graph)
+    two_matrices("intrinsics", "1 2 3 3", &[1, 2, 3, 3], &camera, graph)
+}
+
+/// Adds an output with a matrix for each of two photos.
+fn two_matrices(name: &str, shape: &str, dims: &[u64], one: &[f32], graph: Onnx) -> Onnx {
+    let kept = format!("the_{name}");
+    graph.output(name, shape).weight(&kept, dims, &one.repeat(2)).node("Identity", &kept, name, &[])
 }
 
 fn sam_encoder() -> Onnx {
@@ -84,7 +86,7 @@ fn sam_decoder() -> Onnx {
     saying(graph, &[("low_res_masks", "1 4 8 8", 1.0), ("iou_predictions", "1 4", 0.9)])
 }
 
-/// What the server gives for each file of the pack.
+/// Response of the server for each file of the pack.
 fn bodies() -> HashMap<String, Vec<u8>> {
     let mut all = HashMap::new();
     for entry in catalogue().iter().filter(|k| k.packs.contains(&"open".into())) {
@@ -107,7 +109,7 @@ fn bodies() -> HashMap<String, Vec<u8>> {
     all
 }
 
-/// The entry with what the server has of it: another content, so other checksums.
+/// The entry without checksums and sizes, as the server has other content.
 fn as_served(entry: &CatalogueEntry) -> CatalogueEntry {
     let unpinned = |s: &Source| Source { bytes: None, sha256: None, ..s.clone() };
     CatalogueEntry { files: entry.files.iter().map(unpinned).collect(), ..entry.clone() }
@@ -115,7 +117,7 @@ fn as_served(entry: &CatalogueEntry) -> CatalogueEntry {
 
 #[test]
 #[ignore = "1.1 GB; prints the figures of docs/use/models.md"]
-fn the_open_pack_at_full_size() {
+fn open_pack_fetches_at_full_size() {
     let bodies: HashMap<String, File> =
         bodies().into_iter().map(|(from, body)| (from, File::new(&body))).collect();
     let server = Server::start(move |r, _, s| {

@@ -1,5 +1,5 @@
-//! `splatvk models fetch` against a server on this machine: what goes wrong on networks, disks and
-//! with processes, and that a model is there whole or not at all.
+//! `splatvk models fetch` with a local server: failures of networks, disks and processes; a model
+//! is complete or absent.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 #[allow(dead_code)] // other tests use the rest
 #[path = "../fixture/command.rs"]

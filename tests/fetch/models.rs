@@ -1,4 +1,4 @@
-//! Whole models: asked for, downloaded or exported, checked, installed, replaced, killed.
+//! Whole models: consent, download or export, check, installation, replacement, kills.
 use super::server::{File, Server, plain};
 use super::sha256;
 use splatlab::generate::regions::InjectedErrors;
@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
-/// A network of depth that says how bright a pixel is. Not for commercial use, one file without a
-/// checksum in the catalogue.
+/// A depth network that returns the brightness of a pixel. Not for commercial use, one file without
+/// a checksum in the catalogue.
 const DEPTH: &str = "depth_anything_v2_large";
 
 fn depth_network(padding: usize) -> Vec<u8> {
@@ -32,9 +32,9 @@ fn depth_network(padding: usize) -> Vec<u8> {
         .encode()
 }
 
-/// Towers that know three colours: image, text and tokenizer.
+/// Towers for three colours: image, text and tokenizer.
 pub fn clip_graphs() -> (Onnx, Onnx, String) {
-    // Photos come less CLIP's mean, in units of its deviation; black is zero again here.
+    // Images are normalised by CLIP's mean and deviation; the offset makes black zero again.
     let image = Onnx::new()
         .input("image", FLOAT, "batch 3 16 16")
         .output("embedding", "batch 3")
@@ -120,7 +120,7 @@ fn succeeds(command: &mut Command) -> String {
     text(&stdout)
 }
 
-/// The one error line of a command that must fail.
+/// Expects a failure with one error line.
 fn refuses(command: &mut Command, code: i32, words: &[&str]) {
     let Output { status, stderr, .. } = command.output().unwrap();
     let stderr = text(&stderr);
@@ -136,7 +136,7 @@ fn serving(body: &[u8]) -> Server {
 }
 
 #[test]
-fn a_dry_run_prints_every_address_and_file_and_does_nothing() {
+fn dry_run_lists_addresses_and_files() {
     let place = Place::new();
     let server = serving(b"");
     let ids: Vec<&str> = catalogue().iter().map(|k| k.id.as_str()).filter(|id| *id != "lseg").collect();
@@ -167,7 +167,7 @@ fn a_dry_run_prints_every_address_and_file_and_does_nothing() {
 }
 
 #[test]
-fn nothing_is_fetched_that_nobody_agreed_to() {
+fn fetch_needs_licence_consent() {
     let place = Place::new();
     let server = serving(&depth_network(1));
     refuses(&mut place.fetch(&["open"], &server.address), 2, &["--yes", "MB"]);
@@ -182,7 +182,7 @@ fn nothing_is_fetched_that_nobody_agreed_to() {
 }
 
 #[test]
-fn a_model_is_fetched_used_kept_and_replaced() {
+fn fetched_model_is_used_and_replaced() {
     let place = Place::new();
     let network = depth_network(1);
     let server = serving(&network);
@@ -202,12 +202,12 @@ fn a_model_is_fetched_used_kept_and_replaced() {
     let again = succeeds(&mut place.fetch(&get, &server.address));
     assert!(again.contains("is there") && server.requests().is_empty(), "{again}");
 
-    // The source gives something else now: what was pinned at the first fetch stays.
+    // The source serves other content now: it contradicts the checksum pinned at the first fetch.
     let forced = [&get[..], &["--force"]].concat();
     let other = serving(&depth_network(2));
     refuses(&mut place.fetch(&forced, &other.address), 2, &["has changed since it was first fetched"]);
     assert_eq!(std::fs::read(place.at(DEPTH).join("model.onnx")).unwrap(), network);
-    // The installed file is not what it was.
+    // The installed file was changed.
     std::fs::write(place.at(DEPTH).join("model.onnx"), depth_network(3)).unwrap();
     refuses(&mut place.fetch(&get, &server.address), 2, &["was pinned", "--force"]);
     succeeds(&mut place.fetch(&forced, &server.address));
@@ -216,7 +216,7 @@ fn a_model_is_fetched_used_kept_and_replaced() {
 }
 
 #[test]
-fn what_is_no_model_is_not_installed_and_what_is_left_can_be_cleaned() {
+fn fetch_refuses_foreign_files() {
     let place = Place::new();
     let server = serving(b"<html>Log in to this network</html>");
     let get = [DEPTH, "--yes", "--accept", DEPTH];
@@ -225,7 +225,7 @@ fn what_is_no_model_is_not_installed_and_what_is_left_can_be_cleaned() {
         2,
         &["nothing was installed", "not a complete ONNX file"],
     );
-    // A graph of another kind, which passes as one.
+    // An invalid graph in a valid file.
     let place = Place::new();
     let network = Onnx::new()
         .input("pixel_values", FLOAT, "1 3 28 28")
@@ -241,7 +241,7 @@ fn what_is_no_model_is_not_installed_and_what_is_left_can_be_cleaned() {
     let server = serving(&network.encode());
     refuses(&mut place.fetch(&get, &server.address), 2, &["nothing was installed", "NaN"]);
     assert!(!place.at(DEPTH).exists() && place.hidden() == [format!(".fetch-{DEPTH}")]);
-    // Such a model is to replace one that is there.
+    // Such a model as replacement of an installed one.
     std::fs::create_dir(place.at(DEPTH)).unwrap();
     std::fs::write(place.at(DEPTH).join("model.onnx"), depth_network(1)).unwrap();
     refuses(&mut place.fetch(&[&get[..], &["--force"]].concat(), &server.address), 2, &["NaN"]);
@@ -259,12 +259,12 @@ fn what_is_no_model_is_not_installed_and_what_is_left_can_be_cleaned() {
     );
     clean(&["--delete"]);
     assert!(place.hidden().is_empty() && place.at(DEPTH).exists());
-    // A model that a process, killed since, had moved aside to replace it comes back.
+    // A model that a killed process had moved aside is restored.
     super::command::abandon(&place.at(".fetch-da3"), "da3");
     std::fs::rename(place.at(DEPTH), place.at(".fetch-da3/old")).unwrap();
     clean(&["--delete"]);
     assert!(place.hidden().is_empty() && place.at("da3/model.onnx").exists());
-    // A folder of such a name that bears no mark, and a link to one, are somebody's own.
+    // A folder of such a name without a mark, and a link to one, belong to the user.
     std::fs::create_dir(place.at(".fetch-mine")).unwrap();
     std::fs::write(place.at(".fetch-mine/letter"), "precious").unwrap();
     #[cfg(unix)]
@@ -305,7 +305,7 @@ fn fetch_clip(place: &Place) -> (Registry, fetch::Report) {
 }
 
 #[test]
-fn several_files_make_one_model_through_the_library() {
+fn library_fetches_model_of_several_files() {
     let place = Place::new();
     let (registry, report) = fetch_clip(&place);
     assert_eq!((report.files.len(), report.folder), (3, place.at("clip_toy")));
@@ -316,10 +316,10 @@ fn several_files_make_one_model_through_the_library() {
     assert_eq!(found.models.iter().map(|m| m.name.as_str()).collect::<Vec<_>>(), ["clip_toy"]);
 }
 
-/// Towers that know colours find what is red in a scene that they described. Whether it is there
-/// they cannot say: they know no word that could be meant instead.
+/// Towers for colours locate red things in a scene that they described. They cannot decide
+/// presence: they have no words for alternatives.
 #[test]
-fn what_was_fetched_describes_a_scene_and_answers_about_it() {
+fn fetched_model_describes_scene() {
     let place = Place::new();
     fetch_clip(&place);
     let built_in = Registry::open(None).unwrap();
@@ -359,9 +359,9 @@ fn what_was_fetched_describes_a_scene_and_answers_about_it() {
     }
 }
 
-/// Twenty times killed anywhere, then once left alone.
+/// Killed twenty times at any point, then undisturbed.
 #[test]
-fn a_killed_fetch_leaves_a_whole_model_or_none_and_the_next_goes_on() {
+fn killed_fetch_resumes() {
     let place = Place::new();
     let network = depth_network(1 << 20);
     let file = File { pause: Duration::from_millis(15), ..File::new(&network) };
@@ -380,7 +380,7 @@ fn a_killed_fetch_leaves_a_whole_model_or_none_and_the_next_goes_on() {
             whole += 1;
             assert_eq!(std::fs::read(place.at(DEPTH).join("model.onnx")).unwrap(), network, "after kill {k}");
             assert!(place.at(DEPTH).join("adapter.toml").exists());
-            // Also the replacement of one is to be interrupted.
+            // The replacement of a model is to be interrupted, too.
             if whole > 2 {
                 std::fs::remove_dir_all(place.at(DEPTH)).unwrap();
                 whole = 0;
@@ -394,7 +394,7 @@ fn a_killed_fetch_leaves_a_whole_model_or_none_and_the_next_goes_on() {
 }
 
 #[test]
-fn two_processes_do_not_fetch_one_model() {
+fn concurrent_fetch_is_refused() {
     let place = Place::new();
     let network = depth_network(1 << 18);
     let file = File { pause: Duration::from_millis(300), ..File::new(&network) };
@@ -409,7 +409,7 @@ fn two_processes_do_not_fetch_one_model() {
 }
 
 #[test]
-fn a_proxy_carries_what_it_is_asked_to() {
+fn fetch_uses_http_proxy() {
     let place = Place::new();
     let server = serving(&depth_network(1));
     let target = server.address.strip_prefix("http://").unwrap().to_owned();
@@ -420,13 +420,13 @@ fn a_proxy_carries_what_it_is_asked_to() {
             tunnel(client, &target);
         }
     });
-    // The host exists nowhere; only the proxy knows the way.
+    // The host does not exist; only the proxy can reach it.
     let mut command = place.fetch(&[DEPTH, "--yes", "--accept", DEPTH], "http://models.invalid");
     succeeds(command.env("HTTP_PROXY", address));
     assert_eq!(server.requests().len(), 1);
 }
 
-/// Answers one CONNECT and passes bytes on, both ways.
+/// Answers one CONNECT and forwards bytes in both directions.
 fn tunnel(mut client: TcpStream, target: &str) {
     let mut head = Vec::new();
     let mut byte = [0];
@@ -441,7 +441,7 @@ fn tunnel(mut client: TcpStream, target: &str) {
     std::thread::spawn(move || std::io::copy(&mut server, &mut client));
 }
 
-/// A Python that copies prepared files instead of exporting a network.
+/// A fake Python that copies prepared files instead of exporting a network.
 fn python(folder: &Path, script: &str) -> String {
     use std::os::unix::fs::PermissionsExt;
     let path = folder.join("bin/python3");
@@ -452,7 +452,7 @@ fn python(folder: &Path, script: &str) -> String {
 }
 
 #[test]
-fn a_network_without_public_files_is_exported_in_an_environment_that_vanishes() {
+fn export_recipe_removes_environment() {
     let place = Place::new();
     let toys = place.folder.path().join("toys");
     std::fs::create_dir(&toys).unwrap();

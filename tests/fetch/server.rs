@@ -1,10 +1,10 @@
-//! A web server on 127.0.0.1 that misbehaves on demand, with nothing but sockets.
+//! A web server on 127.0.0.1 that misbehaves on demand, built on sockets only.
 use std::io::{BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-/// What a client asked for; header names in lower case.
+/// Request of a client; header names in lower case.
 #[derive(Clone, Debug)]
 pub struct Request {
     pub path: String,
@@ -16,7 +16,7 @@ impl Request {
         self.headers.iter().find(|(n, _)| n == name).map(|(_, v)| v.as_str())
     }
 
-    /// First byte that is asked for.
+    /// First requested byte.
     pub fn first(&self) -> Option<usize> {
         self.header("range")?.strip_prefix("bytes=")?.strip_suffix('-')?.parse().ok()
     }
@@ -28,7 +28,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// `answer` gets every request, with how many came before it, and writes to the connection,
+    /// `answer` gets every request with the number of earlier ones, and writes to the connection,
     /// which is closed afterwards.
     pub fn start(answer: impl Fn(&Request, usize, &mut TcpStream) + Send + Sync + 'static) -> Server {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -52,7 +52,7 @@ impl Server {
         Server { address, log }
     }
 
-    /// The requests since the last call.
+    /// Requests since the last call.
     pub fn requests(&self) -> Vec<Request> {
         std::mem::take(&mut self.log.lock().unwrap())
     }
@@ -73,16 +73,16 @@ fn read(stream: &TcpStream) -> Option<Request> {
     Some(Request { path, headers })
 }
 
-/// How a file is served.
+/// A served file and its faults.
 #[derive(Clone)]
 pub struct File {
     pub body: Arc<Vec<u8>>,
     pub etag: &'static str,
-    /// Whether it answers with the part that is asked for.
+    /// Whether range requests are supported.
     pub ranges: bool,
-    /// Closes the connection after so many bytes of the body.
+    /// Closes the connection after this many bytes of the body.
     pub cut: Option<usize>,
-    /// Between pieces of 256 KiB.
+    /// Pause between pieces of 256 KiB.
     pub pause: Duration,
 }
 
@@ -96,7 +96,7 @@ impl File {
         File { cut: Some(bytes), ..self }
     }
 
-    /// Sends the file, or the part of it that is asked for.
+    /// Sends the file, or the requested part of it.
     pub fn send(&self, request: &Request, stream: &mut TcpStream) {
         let same = request.header("if-range").is_none_or(|v| v == self.etag);
         let first = request.first().filter(|_| self.ranges && same);
@@ -114,7 +114,7 @@ impl File {
         };
         let body = &self.body[first.unwrap_or(0)..];
         let body = &body[..self.cut.unwrap_or(body.len()).min(body.len())];
-        // A client that goes away is part of the tests.
+        // Clients that disconnect are part of the tests.
         let mut send = || {
             write!(stream, "{head}ETag: {etag}\r\nConnection: close\r\n\r\n")?;
             for piece in body.chunks(1 << 18) {
@@ -127,7 +127,7 @@ impl File {
     }
 }
 
-/// An answer without a file.
+/// Sends a response without a file.
 pub fn plain(stream: &mut TcpStream, status: &str, headers: &[&str]) {
     let headers: String = headers.iter().map(|h| format!("{h}\r\n")).collect();
     let _ = write!(stream, "HTTP/1.1 {status}\r\n{headers}Content-Length: 0\r\nConnection: close\r\n\r\n");

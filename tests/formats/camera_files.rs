@@ -1,5 +1,4 @@
-//! Camera files: what is written reads back, files of other programs are understood, and lenses are
-//! kept or named.
+//! Camera files: round trips, files of other programs, and distortion.
 use super::some_cameras;
 use glam::{DQuat, DVec3};
 use splatvk::format::{cameras, colmap, transforms};
@@ -53,9 +52,9 @@ fn cameras_round_trip() {
 }
 
 #[test]
-fn transforms_are_camera_to_world_in_opengl_axes() {
-    // A camera at (1, 2, 3) that looks along world +x with world −z up: OpenCV right = +y... worked
-    // out by hand.
+fn transforms_are_opengl_camera_to_world() {
+    // A camera at (1, 2, 3) that looks along world +x with world −z up: OpenCV right = +y...
+    // computed by hand.
     let text = r#"{"fl_x": 400, "w": 640, "h": 480, "frames": [{"file_path": "a.png", "fl_x": 500,
         "transform_matrix": [[0, 0, -1, 1], [1, 0, 0, 2], [0, -1, 0, 3], [0, 0, 0, 1]]}]}"#;
     let folder = tempfile::tempdir().unwrap();
@@ -80,7 +79,7 @@ fn transforms_are_camera_to_world_in_opengl_axes() {
 }
 
 #[test]
-fn colmap_binary_model() {
+fn colmap_binary_model_round_trips() {
     let folder = tempfile::tempdir().unwrap();
     let cams = some_cameras();
     let (mut c, mut im) = (3u64.to_le_bytes().to_vec(), 3u64.to_le_bytes().to_vec());
@@ -110,39 +109,37 @@ fn colmap_binary_model() {
 }
 
 #[test]
-fn colmap_cameras_of_one_focal_length() {
+fn colmap_reads_single_focal_models() {
     let folder = tempfile::tempdir().unwrap();
     let (mut cameras, mut images) = (String::new(), String::new());
     for (i, model) in ["SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"].into_iter().enumerate() {
-        // f, the principal point, and as many terms of distortion as the model has.
+        // f, the principal point, and as many distortion terms as the model has.
         cameras += &format!("{i} {model} 640 480 500 321 242{}\n", " 0".repeat(i));
         images += &format!("{i} 1 0 0 0 0 0 0 {i} {i}.png\n\n");
     }
     std::fs::write(folder.path().join("cameras.txt"), cameras).unwrap();
     std::fs::write(folder.path().join("images.txt"), images).unwrap();
     let read = colmap::read(folder.path()).unwrap();
-    let optics = |c: &Camera| [c.fx, c.fy, c.cx, c.cy];
-    assert!(read.len() == 3 && read.iter().all(|c| optics(&c.camera) == [500.0, 500.0, 321.0, 242.0]));
+    assert!(read.len() == 3 && read.iter().all(|c| intrinsics_of(&c.camera) == [500.0, 500.0, 321.0, 242.0]));
+}
+
+fn intrinsics_of(c: &Camera) -> [f64; 4] {
+    [c.fx, c.fy, c.cx, c.cy]
 }
 
 #[test]
-fn what_no_pinhole_can_be_is_refused() {
+fn impossible_pinholes_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("t.json");
     let identity = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]";
-    let frame = |extra: &str, m: &str| {
-        format!(
-            r#"{{"w": 64, "h": 48, {extra} "frames": [{{"file_path": "a.png", "transform_matrix": {m}}}]}}"#
-        )
-    };
     let cases = [
         ("{", "not a JSON camera file"),
         ("{}", "neither transforms.json"),
         (r#"{"frames": []}"#, "no cameras"),
-        (&frame("", identity), "no focal length"),
-        (&frame(r#""fl_x": -50,"#, identity), "must be positive"),
-        (&frame(r#""fl_x": 50,"#, "[[1,0,0,0]]"), "4 × 4"),
-        (&frame(r#""fl_x": 50,"#, "[[2,0,0,0],[0,1,0,0],[0,0,1,0]]"), "not a rotation"),
+        (&frame_with("", identity), "no focal length"),
+        (&frame_with(r#""fl_x": -50,"#, identity), "must be positive"),
+        (&frame_with(r#""fl_x": 50,"#, "[[1,0,0,0]]"), "4 × 4"),
+        (&frame_with(r#""fl_x": 50,"#, "[[2,0,0,0],[0,1,0,0],[0,0,1,0]]"), "not a rotation"),
     ];
     for (text, words) in cases {
         std::fs::write(&path, text).unwrap();
@@ -157,8 +154,12 @@ fn what_no_pinhole_can_be_is_refused() {
     assert_eq!(cameras::read(folder.path()).unwrap_err().exit_code(), 2);
 }
 
+fn frame_with(extra: &str, m: &str) -> String {
+    format!(r#"{{"w": 64, "h": 48, {extra} "frames": [{{"file_path": "a.png", "transform_matrix": {m}}}]}}"#)
+}
+
 #[test]
-fn cameras_of_photos_as_taken_carry_their_lens() {
+fn original_cameras_include_lens() {
     let dir = tempfile::tempdir().unwrap();
     let list: Vec<Camera> = some_cameras().into_iter().chain(some_cameras()).collect();
     let list: Vec<Camera> = list
@@ -187,7 +188,7 @@ fn cameras_of_photos_as_taken_carry_their_lens() {
         let read = cameras::read_file(path).unwrap();
         assert_eq!(read.cameras.iter().map(|c| c.lens).collect::<Vec<_>>(), lenses);
         assert_same_cameras(&read.cameras.iter().map(|c| c.camera.clone()).collect::<Vec<_>>(), &list);
-        // Views are rendered of the pinholes, which is said.
+        // Rendered views use the pinholes, with a warning.
         let (pinholes, warnings) = read.pinholes();
         assert!(
             pinholes.len() == 6 && warnings.len() == 1 && warnings[0].starts_with("5 of 6"),
@@ -241,7 +242,7 @@ fn camera_models_are_read_or_named() {
         let e = read(extra).unwrap_err();
         assert!(e.exit_code() == 2 && e.to_string().contains(words), "{extra}: {e}");
     }
-    // Values of a frame count before those that the file states for all.
+    // Values of a frame take precedence over shared values of the file.
     let own = one_frame(r#""k1": 0.1,"#)
         .replace(r#""file_path""#, r#""k1": 0.05, "camera_model": "OPENCV", "file_path""#);
     std::fs::write(&path, own).unwrap();
@@ -250,7 +251,7 @@ fn camera_models_are_read_or_named() {
 }
 
 #[test]
-fn frames_without_matrix_are_skipped_and_named() {
+fn transforms_skip_frames_without_matrix() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("t.json");
     let more = |frame: &str| one_frame("").replace(r#""frames": ["#, &format!(r#""frames": [{frame}, "#));
@@ -261,7 +262,7 @@ fn frames_without_matrix_are_skipped_and_named() {
     }
     std::fs::write(&path, r#"{"fl_x": 50, "frames": [{"file_path": "b.png"}]}"#).unwrap();
     assert!(cameras::read_file(&path).unwrap_err().to_string().contains("b.png"));
-    // Twice the same name, spelt in two ways.
+    // The same name twice, spelled in two ways.
     let again = one_frame("").replace(
         "]]}",
         r#"]]}, {"file_path": "./a.png", "transform_matrix":
@@ -271,7 +272,7 @@ fn frames_without_matrix_are_skipped_and_named() {
     assert!(cameras::read_file(&path).unwrap_err().to_string().contains("two cameras have the name"));
 }
 
-/// A COLMAP model in text of two photos.
+/// Writes a COLMAP model in text.
 fn model(folder: &Path, cameras: &str, images: &str) {
     std::fs::create_dir_all(folder).unwrap();
     std::fs::write(folder.join("cameras.txt"), cameras).unwrap();
@@ -279,7 +280,7 @@ fn model(folder: &Path, cameras: &str, images: &str) {
 }
 
 #[test]
-fn colmap_text_is_read_as_people_write_it() {
+fn colmap_text_reads_handwritten_variants() {
     let folder = tempfile::tempdir().unwrap();
     let cases = [
         (

@@ -1,5 +1,4 @@
-//! File formats: what is written reads back, foreign files are understood, damaged ones are refused
-//! in one line.
+//! File formats: round trips, files of other programs, and one-line errors for damaged files.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod camera_files;
 
@@ -16,7 +15,7 @@ fn data(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data").join(name)
 }
 
-/// Numbers in (−1, 1) from a hash: every value differs, so swapped columns cannot go unnoticed.
+/// Numbers in (−1, 1) from a hash: every value differs, so that exchanged columns are detected.
 fn noise(i: usize) -> f32 {
     let h = (i as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
     ((h >> 40) as f32 / (1u64 << 23) as f32) - 1.0
@@ -60,7 +59,7 @@ fn some_cameras() -> Vec<Camera> {
 }
 
 #[test]
-fn gaussian_ply_round_trip() {
+fn gaussian_ply_round_trips() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.ply");
     for degree in 0..=3 {
@@ -83,7 +82,7 @@ fn gaussian_ply_round_trip() {
 }
 
 #[test]
-fn ply_has_the_fields_in_the_order_of_the_format() {
+fn ply_fields_follow_format_order() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.ply");
     let s = splats(2, 1);
@@ -134,7 +133,7 @@ fn field(n: usize) -> LanguageField {
 }
 
 #[test]
-fn files_of_other_programs() {
+fn ply_of_other_programs_is_read() {
     // Written by trimesh, kept in the brush repository: 100 coloured points, no Gaussians.
     let points = ply::read_points(&data("formats/brush_init.ply")).unwrap().0;
     assert!(
@@ -156,7 +155,7 @@ fn files_of_other_programs() {
         (p.positions.as_slice(), p.colours[0]),
         (&[[1.5, 2.0, 3.0], [-1.0, -2.0, -3.0]][..], [1.0, 0.0, 0.2])
     );
-    // The other order of bytes.
+    // Big-endian.
     let header = "ply\nformat binary_big_endian 1.0\nelement vertex 1\nproperty double x\nproperty float y\n\
                   property short z\nend_header\n";
     let mut bytes = header.as_bytes().to_vec();
@@ -189,7 +188,7 @@ fn damaged_ply_files_are_refused() {
 }
 
 #[test]
-fn splat_file_layout() {
+fn splat_file_has_documented_layout() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.splat");
     let mut s = splats(2, 1);
@@ -207,28 +206,35 @@ fn splat_file_layout() {
 
 /// Largest differences of two scenes: positions, log scales, rotations (1 − |q·q'|), opacities, SH.
 fn differences(a: &Splats, b: &Splats) -> [f32; 5] {
-    let worst = |x: &[f32], y: &[f32]| {
-        assert_eq!(x.len(), y.len());
-        x.iter().zip(y).fold(0f32, |m, (x, y)| m.max((x - y).abs()))
-    };
-    let unit = |q: &[f32; 4]| q.map(|v| v / q.iter().map(|v| v * v).sum::<f32>().sqrt());
     let turn = a.quats.iter().zip(&b.quats).fold(0f32, |m, (p, q)| {
-        m.max(1.0 - unit(p).iter().zip(unit(q)).map(|(x, y)| x * y).sum::<f32>().abs())
+        m.max(1.0 - normalised(p).iter().zip(normalised(q)).map(|(x, y)| x * y).sum::<f32>().abs())
     });
-    let opacity = |s: &Splats| s.opacity_logits.iter().map(|v| 1.0 / (1.0 + (-v).exp())).collect::<Vec<_>>();
     [
-        worst(a.means.as_flattened(), b.means.as_flattened()),
-        worst(a.log_scales.as_flattened(), b.log_scales.as_flattened()),
+        max_difference(a.means.as_flattened(), b.means.as_flattened()),
+        max_difference(a.log_scales.as_flattened(), b.log_scales.as_flattened()),
         turn,
-        worst(&opacity(a), &opacity(b)),
-        worst(&a.sh, &b.sh),
+        max_difference(&opacities(a), &opacities(b)),
+        max_difference(&a.sh, &b.sh),
     ]
+}
+
+fn opacities(s: &Splats) -> Vec<f32> {
+    s.opacity_logits.iter().map(|v| 1.0 / (1.0 + (-v).exp())).collect::<Vec<_>>()
+}
+
+fn normalised(q: &[f32; 4]) -> [f32; 4] {
+    q.map(|v| v / q.iter().map(|v| v * v).sum::<f32>().sqrt())
+}
+
+fn max_difference(x: &[f32], y: &[f32]) -> f32 {
+    assert_eq!(x.len(), y.len());
+    x.iter().zip(y).fold(0f32, |m, (x, y)| m.max((x - y).abs()))
 }
 
 /// Half a step of each format (positions and scales of the packed PLY: of 10 bits over the range −1
 /// to 1 of the noise).
 #[test]
-fn packed_formats_round_trip_within_their_precision() {
+fn packed_formats_round_trip_within_precision() {
     let folder = tempfile::tempdir().unwrap();
     for degree in 0..=3 {
         let s = splats(700, degree);
@@ -247,7 +253,7 @@ fn packed_formats_round_trip_within_their_precision() {
             };
             let rows: Vec<usize> =
                 (0..700).map(|j| order.iter().position(|i| *i == j as u32).unwrap()).collect();
-            // The language went with its splats: the two that have features are 0 and 1.
+            // The language follows the order of the splats: the two with features are 0 and 1.
             let features = &field.unwrap().levels[0].features;
             assert_eq!(features[2 * rows[0]..2 * rows[0] + 2], [3.0, 4.0], "{name}");
             assert_eq!(features[2 * rows[1]..2 * rows[1] + 2], [2.0, 0.5], "{name}");
@@ -271,10 +277,10 @@ fn packed_formats_round_trip_within_their_precision() {
 }
 
 #[test]
-fn splat_files_written_by_splat_transform() {
+fn splat_transform_files_are_read() {
     // Four Gaussians at the corners of a square in x and z. splat-transform (MIT, see the licence
-    // there) wrote .splat and versions 3 and 4 from one scene; the version 2 files hold the same
-    // bytes by hand, without the turn of the axes.
+    // there) wrote .splat and versions 3 and 4 from one scene; the version 2 files contain the same
+    // bytes, made by hand without the rotation of the axes.
     let corners = [[-1.0, 0.0, -1.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]];
     let plain = gaussians::read(&data("formats/minimal.splat")).unwrap().0;
     assert_eq!(plain.means, corners);
@@ -310,7 +316,7 @@ fn damaged_packed_files_are_refused() {
         gaussians::write(&path, &s, None).unwrap();
         let whole = std::fs::read(&path).unwrap();
         for cut in (0..whole.len()).step_by(97).skip(1) {
-            // A .splat file cut between two rows is a whole file of fewer Gaussians.
+            // A .splat file cut between two rows is a valid file of fewer Gaussians.
             if name == "a.splat" && cut % 32 == 0 {
                 continue;
             }
@@ -344,19 +350,19 @@ fn language_of_another_file_is_refused() {
 }
 
 #[test]
-fn scene_directory_round_trip() {
+fn scene_directory_round_trips() {
     let folder = tempfile::tempdir().unwrap();
     let three = [0, 1, 2].map(|i| data(&format!("breakfast/images/train_{i:02}.jpg")));
     let photos = photo::load_all(&three, &splatvk::progress::Silent).unwrap();
     let (s, cams, mut language) = (splats(5, 2), some_cameras(), field(5));
-    // One level as mixes of its codes, as training leaves it, and one as plain features.
+    // One level as mixes of its codes, as after training, and one as plain features.
     let raw = std::mem::take(&mut language.levels[0].features);
-    language.levels[0].carry(raw);
+    language.levels[0].set_features(raw);
     language.levels[0].reliability = [0u8, 255, 128, 3, 77].map(|r| f32::from(r) / 255.0).to_vec();
     assert_eq!(language.levels[0].mixes.len(), 5);
     let seen = Seen { pixels: vec![0.0, 1.0, 2.5, 0.01, 7.0] };
     let up = Up {
-        // Halves and quarters survive JSON to the last bit.
+        // Halves and quarters survive JSON exactly.
         direction: glam::DVec3::new(0.5, -0.75, 0.25),
         sigma_degrees: 0.7,
         evidence: vec![UpEvidence::VerticalEdges],
@@ -387,14 +393,14 @@ fn scene_directory_round_trip() {
 
     let features = folder.path().join("language/features.npz");
     let arrays = npy::read_npz(&features).unwrap();
-    let with = |name: &str, array: &NpyArray| {
+    let load_with = |name: &str, array: &NpyArray| {
         let own = arrays.iter().filter(|(n, _)| n.as_str() != name).map(|(n, a)| (n.as_str(), a));
         npy::write_npz(&features, &own.chain([(name, array)]).collect::<Vec<_>>()).unwrap();
         scene_dir::load(folder.path())
     };
-    let e = with("first_s", &NpyArray::u8(&[5], vec![0, 1, 7, 0, 0])).unwrap_err().to_string();
+    let e = load_with("first_s", &NpyArray::u8(&[5], vec![0, 1, 7, 0, 0])).unwrap_err().to_string();
     assert!(e.contains("names codes that its codebook of 2 lacks"), "{e}");
-    let e = with("share_s", &NpyArray::u8(&[4], vec![0; 4])).unwrap_err().to_string();
+    let e = load_with("share_s", &NpyArray::u8(&[4], vec![0; 4])).unwrap_err().to_string();
     assert!(e.contains("share_s has the shape [4] for 5 splats"), "{e}");
     // Version 1: plain features under the name of the level.
     let plain = |l: usize| NpyArray::f32(&[5, 2], language.levels[l].features.clone());

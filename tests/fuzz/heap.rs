@@ -1,8 +1,8 @@
-//! An allocator that counts.
+//! An allocator that counts bytes.
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-/// Bytes that are allocated now, and the most there were.
+/// Currently allocated bytes, and their peak.
 pub struct Heap {
     now: AtomicUsize,
     peak: AtomicUsize,
@@ -13,14 +13,14 @@ impl Heap {
         Heap { now: AtomicUsize::new(0), peak: AtomicUsize::new(0) }
     }
 
-    /// Starts the peak afresh; what is allocated now counts as none.
+    /// Resets the peak; returns the currently allocated bytes as the base.
     pub fn mark(&self) -> usize {
         let now = self.now.load(Relaxed);
         self.peak.store(now, Relaxed);
         now
     }
 
-    /// The most bytes since the mark, above it.
+    /// Peak since the mark, above it, bytes.
     pub fn peak_above(&self, mark: usize) -> usize {
         self.peak.load(Relaxed).saturating_sub(mark)
     }
@@ -31,7 +31,7 @@ impl Heap {
     }
 }
 
-// SAFETY: everything is passed on to the system's allocator; only sums are kept.
+// SAFETY: forwards everything to the system's allocator and only keeps sums.
 unsafe impl GlobalAlloc for Heap {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         self.add(layout.size());
@@ -49,7 +49,7 @@ unsafe impl GlobalAlloc for Heap {
         unsafe { System.dealloc(pointer, layout) }
     }
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        // Both may be there while the content is copied.
+        // Both may exist while the content is copied.
         self.add(size);
         self.now.fetch_sub(layout.size(), Relaxed);
         // SAFETY: the caller's own pointer, layout and size.

@@ -1,9 +1,9 @@
-//! Every reader of outside bytes against damaged files: no panic, an answer within a second, memory
-//! in proportion to the file (docs/use/formats.md#limits), and errors that are the user's to mend.
+//! Every reader of untrusted bytes with damaged files: no panic, a result within a second, memory
+//! in proportion to the file (docs/use/formats.md#limits), and errors that blame the input.
 //!
-//! Coverage-guided fuzzers need a nightly compiler, and on stable Rust their front ends only make
-//! random bytes; so valid files are damaged here ([`mutate`]), those inside of containers with sums
-//! and lengths that are right again ([`readers`]).
+//! Coverage-guided fuzzers need a nightly compiler, and on stable Rust their front ends only
+//! generate random bytes; so valid files are damaged here ([`mutate`]), contents of containers with
+//! corrected checksums and lengths ([`readers`]).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod heap;
 mod mutate;
@@ -25,14 +25,14 @@ static HEAP: Heap = Heap::new();
 /// One reader at a time: the peak of the heap is that of the whole process.
 static ONE: Mutex<()> = Mutex::new(());
 
-/// Seconds of the short form, all readers together.
+/// Default duration, seconds, all readers together.
 const SECONDS: u64 = 60;
 
-/// Findings of one reader after which the others get their turn.
+/// Number of findings after which the next reader runs.
 const MOST_FINDINGS: usize = 5;
 
-/// `SPLATVK_FUZZ_SECONDS` sets the time, `SPLATVK_FUZZ_SEED` another sequence, `SPLATVK_FUZZ_ONLY`
-/// one reader.
+/// `SPLATVK_FUZZ_SECONDS` sets the duration, `SPLATVK_FUZZ_SEED` another sequence,
+/// `SPLATVK_FUZZ_ONLY` one reader.
 #[test]
 fn readers_survive_damaged_files() {
     let _alone = ONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -75,14 +75,13 @@ fn readers_survive_damaged_files() {
     assert!(findings.is_empty(), "{} findings:\n{}", findings.len(), findings.join("\n"));
 }
 
-/// In memory where there is such a place: a file system on a disk waits at every file that is
-/// written again.
+/// A folder in memory where possible: a file system on a disk is slow to rewrite files.
 fn memory_folder() -> TempDir {
     let shared = Path::new("/dev/shm");
     if shared.is_dir() { TempDir::new_in(shared) } else { TempDir::new() }.unwrap()
 }
 
-/// A second look at what took too long: the machine may have been busy with something else.
+/// Verdict of a reader; slow runs are repeated, as the machine may have been busy.
 fn judged(reader: &Reader, folder: &Path) -> Verdict {
     let mut verdict = reader.run(folder);
     for _ in 0..2 {

@@ -1,7 +1,7 @@
-//! Damage to bytes, from a seed.
+//! Seeded damage to bytes.
 use std::ops::Range;
 
-/// Splitmix64 (Steele et al. 2014).
+/// SplitMix64 (Steele et al. 2014).
 pub struct Random(u64);
 
 impl Random {
@@ -15,7 +15,7 @@ impl Random {
         z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         z ^ (z >> 31)
     }
-    /// Below `n`, which is not 0.
+    /// Uniform below `n` > 0.
     pub fn below(&mut self, n: usize) -> usize {
         (self.next() % n as u64) as usize
     }
@@ -28,7 +28,7 @@ impl Random {
     }
 }
 
-/// What texts hold in place of a number or a word.
+/// Replacements of numbers and words in texts.
 const WORDS: [&str; 20] = [
     "0",
     "-1",
@@ -52,7 +52,7 @@ const WORDS: [&str; 20] = [
     "\u{1b}[31m\0",
 ];
 
-/// Lengths that lie.
+/// False lengths.
 const LENGTHS: [u64; 14] = [
     0,
     1,
@@ -72,7 +72,7 @@ const LENGTHS: [u64; 14] = [
 
 const FLOATS: [f32; 8] = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, -0.0, 1e-45, 1e20, -200.0];
 
-/// A copy of a file, damaged in one place, or in up to five: a reader stops at the first that it
+/// A copy of a file, damaged in one to five places: a reader stops at the first damage that it
 /// notices.
 pub fn damaged(whole: &[u8], others: &[&[u8]], random: &mut Random) -> Vec<u8> {
     let mut bytes = whole.to_vec();
@@ -87,7 +87,7 @@ fn once(bytes: &mut Vec<u8>, others: &[&[u8]], random: &mut Random) {
         return bytes.extend((0..random.below(64)).map(|_| 0));
     }
     let n = bytes.len();
-    // Headers are where the counts are.
+    // Counts are in headers.
     let at = if random.below(2) == 0 { random.below(n.min(256)) } else { random.below(n) };
     match random.below(12) {
         0 => bytes[at] ^= 1 << random.below(8),
@@ -131,7 +131,7 @@ fn put(bytes: &mut [u8], at: usize, word: &[u8]) {
     bytes[at..].iter_mut().zip(word).for_each(|(b, w)| *b = *w);
 }
 
-/// Another word in the place of the number or name around a byte.
+/// Replaces the number or name around a byte by another word.
 fn word(bytes: &mut Vec<u8>, at: usize, random: &mut Random) {
     let inside = |b: &u8| b.is_ascii_alphanumeric() || b"+-._".contains(b);
     let start = at - bytes[..at].iter().rev().take_while(|b| inside(b)).count();

@@ -1,4 +1,4 @@
-//! What was found once, small enough to be made here: each within the limits of its reader.
+//! Earlier findings that are small enough to generate: each stays within the limits of its reader.
 use super::readers::{Limits, within};
 use super::{ONE, seeds};
 use splatvk::eval::protocol::{self, ProtocolKind};
@@ -10,8 +10,9 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::PoisonError;
 
-/// Refuses `bytes` as a file called `name` within the limits; the error contains `words`.
-fn refused<T>(name: &str, bytes: &[u8], words: &str, read: impl Fn(&Path) -> Result<T>) {
+/// Expects that `bytes` as a file called `name` are refused within the limits, with `words` in the
+/// error.
+fn assert_refused<T>(name: &str, bytes: &[u8], words: &str, read: impl Fn(&Path) -> Result<T>) {
     let _alone = ONE.lock().unwrap_or_else(PoisonError::into_inner);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join(name);
@@ -30,7 +31,7 @@ fn splats(path: &Path) -> Result<()> {
     gaussians::read(path).map(drop)
 }
 
-/// A `.gltf` with its numbers in `uri` and `nodes` nodes that show one mesh of `count` Gaussians.
+/// A `.gltf` with its buffer in `uri` and `nodes` nodes with one mesh of `count` Gaussians.
 fn gltf(uri: &str, count: usize, nodes: usize) -> Vec<u8> {
     let parts = [("POSITION", 3), ("ROTATION", 4), ("SCALE", 3), ("OPACITY", 1), ("SH_DEGREE_0_COEF_0", 3)];
     let (mut attributes, mut accessors, mut views, mut at) = (serde_json::Map::new(), vec![], vec![], 0);
@@ -61,29 +62,29 @@ fn data_uri(bytes: usize) -> String {
 }
 
 #[test]
-fn one_mesh_of_many_nodes_is_counted_before_it_is_made() {
+fn gltf_counts_mesh_instances_first() {
     let bytes = gltf(&data_uri(56_000), 1000, 90_000);
-    refused("a.gltf", &bytes, "show 90000000 Gaussians", splats);
-    refused("a.gltf", &gltf(&data_uri(56), 1, 200_000), "more than the 100000 that are read", splats);
-    // Without scenes the nodes that are below others were looked for in every other.
+    assert_refused("a.gltf", &bytes, "show 90000000 Gaussians", splats);
+    assert_refused("a.gltf", &gltf(&data_uri(56), 1, 200_000), "more than the 100000 that are read", splats);
+    // Without scenes, finding the roots once took a search in all other nodes.
     let nodes: Vec<_> = (0..60_000).map(|k| serde_json::json!({ "children": [k + 1] })).collect();
     let chain = serde_json::json!({ "nodes": nodes }).to_string();
-    refused("a.gltf", chain.as_bytes(), "there is no node 60000", splats);
+    assert_refused("a.gltf", chain.as_bytes(), "there is no node 60000", splats);
 }
 
 #[test]
-fn buffers_come_from_the_folder_of_the_file() {
+fn gltf_buffers_stay_in_folder() {
     for uri in ["/dev/zero", "../a.bin", "b/../../a.bin", "/etc/hostname", "..\\a.bin"] {
-        refused("a.gltf", &gltf(uri, 1, 1), "outside of the file's folder", splats);
+        assert_refused("a.gltf", &gltf(uri, 1, 1), "outside of the file's folder", splats);
     }
-    refused("a.gltf", &gltf("none.bin", 1, 1), "none.bin", splats);
+    assert_refused("a.gltf", &gltf("none.bin", 1, 1), "none.bin", splats);
     #[cfg(unix)]
     {
         let outside = tempfile::NamedTempFile::new().unwrap();
         for (target, words) in
             [(PathBuf::from("/dev/zero"), "outside of"), (outside.path().to_path_buf(), "outside of")]
         {
-            refused("a.gltf", &gltf("link.bin", 1, 1), words, |path| {
+            assert_refused("a.gltf", &gltf("link.bin", 1, 1), words, |path| {
                 let link = path.with_file_name("link.bin");
                 std::os::unix::fs::symlink(&target, &link).unwrap();
                 splats(path)
@@ -93,50 +94,54 @@ fn buffers_come_from_the_folder_of_the_file() {
 }
 
 #[test]
-fn a_small_archive_does_not_become_a_large_one() {
+fn npz_refuses_decompression_bomb() {
     let array = npy::encode(&npy::NpyArray::u8(&[100], vec![7; 100])).unwrap();
-    let packed = |header: &[u8]| {
-        let method = zip::CompressionMethod::Deflated;
-        let options = zip::write::SimpleFileOptions::default().compression_method(method);
-        let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
-        zip.start_file("a.npy", options).unwrap();
-        zip.write_all(header).unwrap();
-        (0..200).for_each(|_| zip.write_all(&[0; 1 << 20]).unwrap());
-        zip.finish().unwrap().into_inner()
-    };
-    refused("a.npz", &packed(&array), "more follow", |p| npy::read_npz(p));
+    assert_refused("a.npz", &zip_with_zeros(&array), "more follow", |p| npy::read_npz(p));
     let stated = std::str::from_utf8(&array[10..128]).unwrap().replace("(100,)", "(209715200,)");
     let header = [&array[..10], &stated.as_bytes()[..118]].concat();
-    refused("a.npz", &packed(&header), "far more than the file can hold", |p| npy::read_npz(p));
+    assert_refused("a.npz", &zip_with_zeros(&header), "far more than the file can hold", |p| {
+        npy::read_npz(p)
+    });
+}
+
+/// Archive of one array: `header`, then 200 MiB of zeros.
+fn zip_with_zeros(header: &[u8]) -> Vec<u8> {
+    let method = zip::CompressionMethod::Deflated;
+    let options = zip::write::SimpleFileOptions::default().compression_method(method);
+    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    zip.start_file("a.npy", options).unwrap();
+    zip.write_all(header).unwrap();
+    (0..200).for_each(|_| zip.write_all(&[0; 1 << 20]).unwrap());
+    zip.finish().unwrap().into_inner()
 }
 
 #[test]
-fn a_count_in_a_compressed_file_is_held_against_its_size() {
+fn compressed_count_is_checked_against_size() {
     let mut head = [0x5053_474eu32, 3, 50_000_000, 0].map(u32::to_le_bytes).concat();
     (head[12], head[13]) = (3, 12);
     let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
     gzip.write_all(&head).unwrap();
     gzip.write_all(&vec![0; 4 << 20]).unwrap();
-    refused("a.spz", &gzip.finish().unwrap(), "50000000 Gaussians are far more", splats);
+    assert_refused("a.spz", &gzip.finish().unwrap(), "50000000 Gaussians are far more", splats);
 }
 
 #[test]
-fn many_columns_and_values_take_neither_time_nor_memory() {
+fn excessive_values_are_refused_early() {
     let columns: String = (0..60_000).map(|k| format!("property float f_rest_{k}\n")).collect();
     let ply = format!("ply\nformat binary_little_endian 1.0\nelement vertex 0\n{columns}end_header\n");
-    refused("a.ply", ply.as_bytes(), "", splats);
+    assert_refused("a.ply", ply.as_bytes(), "", splats);
     let most = "element vertex 18446744073709551615\nproperty float x\nelement b 18446744073709551615\n";
     let ply = format!("ply\nformat ascii 1.0\n{most}end_header\n0\n");
-    refused("a.ply", ply.as_bytes(), "", splats);
+    assert_refused("a.ply", ply.as_bytes(), "", splats);
     let numbers = "[0,0,0,0,0,0,0,0],".repeat(400_000);
     let json = format!("{{\"other\":[{numbers}0],\"frames\":[]}}");
-    refused("a.json", json.as_bytes(), "values, more than the", cameras::read);
+    assert_refused("a.json", json.as_bytes(), "values, more than the", cameras::read);
     let frames = "{\"transform_matrix\":[]},".repeat(100_000);
-    refused("a.json", format!("{{\"frames\":[{frames}{{}}]}}").as_bytes(), "4 × 4", cameras::read);
+    assert_refused("a.json", format!("{{\"frames\":[{frames}{{}}]}}").as_bytes(), "4 × 4", cameras::read);
 }
 
 #[test]
-fn a_text_model_without_lines_of_points_keeps_all_its_cameras() {
+fn colmap_text_without_points_keeps_cameras() {
     let folder = tempfile::tempdir().unwrap();
     let image = |k: usize| format!("{k} 1 0 0 0 0 0 {k} 1 photo {k}.jpg\n");
     let read = |images: String| {
@@ -148,7 +153,7 @@ fn a_text_model_without_lines_of_points_keeps_all_its_cameras() {
     for between in ["", "\n", "1.5 2.5 -1 3 4 17\n", "# remark\n\n"] {
         assert_eq!(read((1..=5).map(|k| image(k) + between).collect()).unwrap(), wanted, "{between:?}");
     }
-    // Some images have points, some have not even the line.
+    // Some images have points, some lack even the line.
     let mixed = [image(1), image(2), "1 2 3\n".into(), image(3), "\n".into(), image(4), image(5)].concat();
     assert_eq!(read(mixed).unwrap(), wanted);
     let e = read(image(1) + "1.5 2.5\n" + &image(2)).unwrap_err().to_string();
@@ -156,20 +161,29 @@ fn a_text_model_without_lines_of_points_keeps_all_its_cameras() {
 }
 
 #[test]
-fn labels_of_any_size_are_read_in_time() {
-    let labels = |size: usize, corner: f64, objects: usize| {
-        let object = |k: usize| serde_json::json!({ "category": k.to_string(), "segmentation": [[0, 0], [corner, 1], [2, corner]] });
-        let objects: Vec<_> = (0..objects).map(object).collect();
-        serde_json::json!({ "info": { "width": size, "height": size }, "objects": objects }).to_string()
-    };
-    let read = |p: &Path| protocol::labels(ProtocolKind::Lerf, p.parent().unwrap()).map(drop);
+fn oversized_labels_are_refused() {
     // A line of that many pixels took 20 s, one of 1e19 never ended.
-    refused("a.json", labels(16, 1e9, 1).as_bytes(), "a corner is beyond 1000000 pixels", read);
-    refused("a.json", labels(14_000, 9.0, 2).as_bytes(), "2 objects of 14000", read);
+    assert_refused(
+        "a.json",
+        lerf_labels(16, 1e9, 1).as_bytes(),
+        "a corner is beyond 1000000 pixels",
+        read_lerf,
+    );
+    assert_refused("a.json", lerf_labels(14_000, 9.0, 2).as_bytes(), "2 objects of 14000", read_lerf);
+}
+
+fn read_lerf(p: &Path) -> splatvk::Result<()> {
+    protocol::labels(ProtocolKind::Lerf, p.parent().unwrap()).map(drop)
+}
+
+fn lerf_labels(size: usize, corner: f64, objects: usize) -> String {
+    let object = |k: usize| serde_json::json!({ "category": k.to_string(), "segmentation": [[0, 0], [corner, 1], [2, corner]] });
+    let objects: Vec<_> = (0..objects).map(object).collect();
+    serde_json::json!({ "info": { "width": size, "height": size }, "objects": objects }).to_string()
 }
 
 #[test]
-fn an_adapter_states_what_images_can_be_prepared_by() {
+fn adapter_checks_image_preparation() {
     let read = |p: &Path| Adapter::of_file(&p.with_file_name("m.onnx"));
     for (field, words) in [
         ("size = 518, multiple = 0", "between 1 and 16384"),
@@ -178,19 +192,19 @@ fn an_adapter_states_what_images_can_be_prepared_by() {
     ] {
         let image = format!("{{ mean = [0.5, 0.5, 0.5], std = [0.5, 0.5, 0.5], {field} }}");
         let text = format!("[[graph]]\npart = \"depth\"\nimage = {image}\n");
-        refused("adapter.toml", text.as_bytes(), words, read);
+        assert_refused("adapter.toml", text.as_bytes(), words, read);
         let flat = text.replace("std = [0.5", "std = [0.0").replace(field, "size = 518");
-        refused("adapter.toml", flat.as_bytes(), "std positive", read);
+        assert_refused("adapter.toml", flat.as_bytes(), "std positive", read);
     }
 }
 
 #[test]
-fn sides_of_more_than_32_bits_are_not_cut() {
+fn oversized_colmap_sides_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     for seed in seeds::colmap(true) {
         let mut bytes = seed.bytes;
         if seed.name == "cameras.bin" {
-            // After the count, the number and the model: 64 + 2^32.
+            // After the count, the id and the model: 64 + 2^32.
             bytes[8 + 8 + 4] = 1;
         }
         std::fs::write(folder.path().join(&seed.name), bytes).unwrap();
@@ -200,18 +214,18 @@ fn sides_of_more_than_32_bits_are_not_cut() {
 }
 
 #[test]
-fn weights_lie_beside_their_graph() {
+fn graph_weights_stay_in_folder() {
     for place in ["../ab", "/ab.b"] {
         let whole = seeds::onnx();
         let at = whole.windows(5).position(|w| w == b"w.bin").unwrap();
         let bytes = [&whole[..at], place.as_bytes(), &whole[at + 5..]].concat();
-        refused("m.onnx", &bytes, "outside of its folder", onnx::read);
+        assert_refused("m.onnx", &bytes, "outside of its folder", onnx::read);
     }
 }
 
 #[test]
-fn seeds_are_whole() {
-    // What the harness itself relies on: containers put back what they took out.
+fn seed_containers_round_trip() {
+    // The harness relies on this: containers restore their content.
     for seed in [seeds::npz("a"), seeds::checkpoint("a"), seeds::gzip("a"), seeds::picture("a.png")] {
         let container = seed.container.unwrap();
         let same = container(&seed.bytes, &mut |inside| inside.to_vec());

@@ -1,4 +1,4 @@
-//! Valid files, most of them made by the program's own writers.
+//! Valid files, mostly from the program's own writers.
 use super::readers::{Container, Seed};
 use exif::experimental::Writer as ExifWriter;
 use exif::{Field, In, Tag, Value};
@@ -21,7 +21,7 @@ pub fn file(name: &str, bytes: Vec<u8>) -> Seed {
     Seed { name: name.into(), bytes, damaged: true, container: None }
 }
 
-/// A file that the others need and that stays whole.
+/// A file that others need and that stays intact.
 pub fn kept(name: &str, bytes: Vec<u8>) -> Seed {
     Seed { damaged: false, ..file(name, bytes) }
 }
@@ -30,7 +30,7 @@ fn inside(name: &str, bytes: Vec<u8>, container: Container) -> Seed {
     Seed { container: Some(container), ..file(name, bytes) }
 }
 
-/// What `write` makes in a folder of its own, by name.
+/// Files that `write` creates in a folder, by name.
 fn made(write: impl FnOnce(&Path)) -> Vec<(String, Vec<u8>)> {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path());
@@ -75,7 +75,7 @@ fn field(n: usize) -> LanguageField {
         min_chord: 1.4,
     };
     let mut level = LevelField { codebook, reliability: vec![0.5; n], ..LevelField::default() };
-    level.carry((0..n).flat_map(|i| if i % 2 == 0 { [1.0, 0.0] } else { [0.6, 0.8] }).collect());
+    level.set_features((0..n).flat_map(|i| if i % 2 == 0 { [1.0, 0.0] } else { [0.6, 0.8] }).collect());
     let raw = LevelField { mixes: Vec::new(), ..level.clone() };
     LanguageField { levels: vec![level, raw, LevelField::default()], space: "dir:test".into() }
 }
@@ -135,7 +135,7 @@ pub fn gzip(name: &str) -> Seed {
     })
 }
 
-/// Its document is damaged, with lengths that are right again.
+/// Damages the JSON document, with corrected lengths.
 pub fn glb(name: &'static str) -> Vec<Seed> {
     let container: Container = |bytes, change| {
         let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
@@ -147,19 +147,19 @@ pub fn glb(name: &'static str) -> Vec<Seed> {
     gaussians(name, 1).into_iter().map(|s| Seed { container: Some(container), ..s }).collect()
 }
 
-/// With the numbers in a file beside it.
+/// With the buffer in a file beside it.
 pub fn gltf() -> Vec<Seed> {
     let glb = gaussians("a.glb", 1).remove(0).bytes;
     let length = u32::from_le_bytes(glb[12..16].try_into().unwrap()) as usize;
     let mut root: serde_json::Value = serde_json::from_slice(&glb[20..20 + length]).unwrap();
     root["buffers"][0]["uri"] = "a.bin".into();
-    // A second node shows the mesh, too.
+    // A second node with the same mesh.
     root["nodes"] =
         serde_json::json!([{ "mesh": 0, "children": [1] }, { "mesh": 0, "translation": [1, 2, 3] }]);
     vec![file("a.gltf", root.to_string().into_bytes()), file("a.bin", glb[28 + length..].to_vec())]
 }
 
-/// One member after the other of an archive.
+/// Damages one member of an archive after the other.
 const MEMBERS: Container = |bytes, change| {
     static TURN: AtomicUsize = AtomicUsize::new(0);
     let mut archive = zip::ZipArchive::new(Cursor::new(bytes)).unwrap();
@@ -175,7 +175,7 @@ const MEMBERS: Container = |bytes, change| {
     out.finish().unwrap().into_inner()
 };
 
-/// What splats carry, beside their file.
+/// Language data of splats, beside their file.
 pub fn language() -> Vec<Seed> {
     let (s, field) = (splats(6, 0), field(6));
     let seeds = made(|f| files::write(&f.join("a.splat"), &s, Some(&field)).unwrap()).into_iter();
@@ -226,7 +226,7 @@ fn scene_files() -> Vec<(String, Vec<u8>)> {
     made(|f| scene_dir::write(f, &contents).unwrap())
 }
 
-/// A scene directory; all is damaged that loading it reads.
+/// A scene directory; every file that is loaded is damaged.
 pub fn scene() -> Vec<Seed> {
     let plain = ["scene.json", "point_cloud.ply", "seen.npy", "cameras/transforms.json"];
     scene_files()
@@ -251,18 +251,19 @@ pub fn run_json() -> Seed {
     file("run.json", serde_json::json!({ "config": { "plan": plan } }).to_string().into_bytes())
 }
 
-/// The state of work, behind its sum.
+/// A checkpoint after its checksum.
 pub fn checkpoint(name: &str) -> Seed {
-    let sum = |body: &[u8]| -> Vec<u8> {
-        let sum: String = Sha256::digest(body).iter().map(|b| format!("{b:02x}")).collect();
-        [sum.as_bytes(), body].concat()
-    };
     let body = postcard::to_stdvec(&(splats(4, 1), field(4))).unwrap();
-    inside(name, sum(&body), |bytes, change| {
+    inside(name, with_checksum(&body), |bytes, change| {
         let body = change(&bytes[64..]);
         let sum: String = Sha256::digest(&body).iter().map(|b| format!("{b:02x}")).collect();
         [sum.as_bytes(), &body].concat()
     })
+}
+
+fn with_checksum(body: &[u8]) -> Vec<u8> {
+    let sum: String = Sha256::digest(body).iter().map(|b| format!("{b:02x}")).collect();
+    [sum.as_bytes(), body].concat()
 }
 
 pub fn adapter() -> Seed {
@@ -298,7 +299,7 @@ pub fn onnx() -> Vec<u8> {
     ];
     let opset = [bytes(1, b""), vec![16, 17]].concat();
     let graph = graph.concat();
-    // Two bytes of length: the graph has more than 127.
+    // Two bytes of length: the graph has more than 127 bytes.
     let length = [graph.len() as u8 & 0x7f | 0x80, (graph.len() >> 7) as u8];
     [&[8, 8, 7 << 3 | 2][..], &length, &graph, &bytes(8, &opset)].concat()
 }
@@ -364,7 +365,7 @@ pub fn scannet() -> Vec<Seed> {
     ]
 }
 
-/// Kind and content of the chunks of a PNG.
+/// Types and contents of the chunks of a PNG.
 fn chunks(bytes: &[u8]) -> Vec<([u8; 4], Vec<u8>)> {
     let (mut at, mut all) = (8, Vec::new());
     while let Some(length) = bytes.get(at..at + 4) {
@@ -375,7 +376,7 @@ fn chunks(bytes: &[u8]) -> Vec<([u8; 4], Vec<u8>)> {
     all
 }
 
-/// A PNG of chunks, with right lengths and sums.
+/// A PNG of chunks, with correct lengths and checksums.
 fn png_of(chunks: &[([u8; 4], Vec<u8>)]) -> Vec<u8> {
     let mut out = b"\x89PNG\r\n\x1a\n".to_vec();
     for (kind, content) in chunks {
@@ -390,7 +391,7 @@ fn png_of(chunks: &[([u8; 4], Vec<u8>)]) -> Vec<u8> {
     out
 }
 
-/// One chunk after the other of a PNG, with right sums.
+/// Damages one chunk of a PNG after the other, with correct checksums.
 const CHUNKS: Container = |bytes, change| {
     static TURN: AtomicUsize = AtomicUsize::new(0);
     let mut all = chunks(bytes);
@@ -399,7 +400,7 @@ const CHUNKS: Container = |bytes, change| {
     png_of(&all)
 };
 
-/// The same, and chunks that are missing, twice there, of every length, or at another place.
+/// Like [`CHUNKS`], and with missing, repeated, resized and moved chunks.
 const ORDER: Container = |bytes, change| {
     static TURN: AtomicUsize = AtomicUsize::new(0);
     let mut all = chunks(bytes);
@@ -421,7 +422,7 @@ fn deflated(bytes: &[u8]) -> Vec<u8> {
     out.finish().unwrap()
 }
 
-/// A PNG with a palette and a chunk of every kind that is read.
+/// A PNG with a palette and a chunk of every type that is read.
 pub fn indexed(name: &str) -> Seed {
     let packet =
         b"<x xmlns:G=\"http://ns.google.com/photos/1.0/panorama/\" G:ProjectionType=\"rectilinear\"/>";
@@ -497,7 +498,7 @@ fn exif_block() -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// The tags of a photo are damaged, the photo is not.
+/// Damages the tags of a photo, not the photo.
 pub fn exif(name: &str) -> Seed {
     inside(name, png_with(Some(exif_block()), None), |_, change| png_with(Some(change(&exif_block())), None))
 }
@@ -506,7 +507,7 @@ fn icc_profile() -> Vec<u8> {
     moxcms::ColorProfile::new_display_p3().encode().unwrap()
 }
 
-/// The same with an ICC profile.
+/// Damages the ICC profile of a photo.
 pub fn icc(name: &str) -> Seed {
     inside(name, png_with(None, Some(icc_profile())), |_, change| {
         png_with(None, Some(change(&icc_profile())))

@@ -4,21 +4,21 @@ use splatvk::gpu::{Buffer, Executor, Groups, Module, NATIVE_FLOAT_ATOMICS, Op, O
 use std::collections::{BTreeSet, HashMap};
 use std::sync::{Arc, LazyLock, Mutex};
 
-/// Another module in the place of one that is shipped.
+/// Replacement for a shipped module; `None` keeps the module.
 pub type Change = Arc<dyn Fn(&Module) -> Option<Vec<u32>> + Send + Sync>;
 
-/// A device that is interpreted.
+/// Interpreted device.
 #[derive(Clone)]
 pub struct Interpreted {
     pub schedule: Schedule,
     pub float_atomics: bool,
-    /// No buffer larger than this, bytes.
+    /// Largest size of a buffer, bytes.
     pub max_binding: Option<u64>,
-    /// Buffers of these names hold nothing when a program begins: what it reads there it must have
-    /// written.
+    /// Names of buffers whose content is undefined when a program begins: the program must write
+    /// before it reads.
     pub scratch: &'static [&'static str],
     pub change: Option<Change>,
-    /// Modules that have run, and buffers that were scratch.
+    /// Modules that have run, and scratch buffers that were used.
     pub ran: Arc<Mutex<BTreeSet<&'static str>>>,
 }
 
@@ -51,15 +51,15 @@ impl Interpreted {
     }
 }
 
-/// Buffers of a program, by identity.
+/// Buffers of a program, by id.
 struct Buffers<'a> {
     on: &'a Interpreted,
     held: HashMap<u64, (Buffer, Memory)>,
 }
 
 impl Buffers<'_> {
-    /// The memory of a buffer. Behind its own bytes a binding goes on to a whole vector of four
-    /// words, which may be read together with the others but must not matter.
+    /// Memory of a buffer. A binding extends beyond its own bytes to a whole vector of four words,
+    /// which may be read with the others but must not affect results.
     fn memory(&mut self, buffer: &Buffer) -> &mut Memory {
         let entry = self.held.entry(buffer.id()).or_insert_with(|| {
             let bytes = buffer.cast::<u8>().read().expect("a mapped buffer");

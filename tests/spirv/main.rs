@@ -1,5 +1,5 @@
-//! The shipped SPIR-V in the interpreter: every pass against its CPU reference at subgroup sizes that no
-//! device at hand has, with faults that no driver reports. See
+//! Runs the shipped SPIR-V in the interpreter: every pass against its CPU reference, at subgroup
+//! sizes that no available device has, with detection of faults that no driver reports. See
 //! docs/internals/trust.md#shaders-without-a-device.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 mod executor;
@@ -15,7 +15,7 @@ use splatvk::gpu::shaders;
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// What passes keep within one program: it must not matter what is there before.
+/// Scratch buffers of passes within one program, whose previous content must not matter.
 const SCRATCH: &[&str] = &[
     "entries",
     "entry splats",
@@ -41,7 +41,7 @@ fn interpreted(subgroup_size: usize, float_atomics: bool) -> Interpreted {
     Interpreted { schedule, float_atomics, max_binding: None, scratch: SCRATCH, change: None, ran }
 }
 
-/// Runs a scene; what it says if it fails.
+/// Runs a scene; returns the panic message if it fails.
 fn outcome(scene: passes::Scene, on: &Interpreted) -> Result<(), String> {
     let run = std::panic::AssertUnwindSafe(|| scene(&on.open()));
     std::panic::catch_unwind(run).map_err(|payload| {
@@ -50,8 +50,8 @@ fn outcome(scene: passes::Scene, on: &Interpreted) -> Result<(), String> {
     })
 }
 
-/// All scenes at a subgroup size, where something is added atomically with native float atomics and
-/// without; the modules and scratch buffers that they used.
+/// Runs all scenes at a subgroup size, those with atomic additions also without native float
+/// atomics. Returns the modules and scratch buffers that were used.
 fn run_all(schedule: Schedule) -> BTreeSet<&'static str> {
     let mut failed = Vec::new();
     let mut ran = BTreeSet::new();
@@ -69,8 +69,8 @@ fn run_all(schedule: Schedule) -> BTreeSet<&'static str> {
     ran
 }
 
-/// Every pass against its reference, and no shader file left out.
-fn every_pass_at(subgroup_size: usize) {
+/// Compares every pass with its reference; no shader file may be left out.
+fn check_passes_at(subgroup_size: usize) {
     let ran = run_all(interpreted(subgroup_size, true).schedule);
     let forgotten: Vec<&str> = shaders::FAMILIES
         .iter()
@@ -83,47 +83,46 @@ fn every_pass_at(subgroup_size: usize) {
 }
 
 #[test]
-fn every_pass_matches_its_twin_at_subgroups_of_4() {
-    every_pass_at(4);
+fn passes_match_reference_at_subgroup_4() {
+    check_passes_at(4);
 }
 
 #[test]
-fn every_pass_matches_its_twin_at_subgroups_of_8() {
-    every_pass_at(8);
+fn passes_match_reference_at_subgroup_8() {
+    check_passes_at(8);
 }
 
 #[test]
-fn every_pass_matches_its_twin_at_subgroups_of_16() {
-    every_pass_at(16);
+fn passes_match_reference_at_subgroup_16() {
+    check_passes_at(16);
 }
 
 #[test]
-fn every_pass_matches_its_twin_at_subgroups_of_32() {
-    every_pass_at(32);
+fn passes_match_reference_at_subgroup_32() {
+    check_passes_at(32);
 }
 
 #[test]
-fn every_pass_matches_its_twin_at_subgroups_of_64() {
-    every_pass_at(64);
+fn passes_match_reference_at_subgroup_64() {
+    check_passes_at(64);
 }
 
-/// Where a device does not bind a whole image.
+/// For devices that do not bind a whole image.
 #[test]
-fn bands_of_an_image_stay_within_their_buffers() {
+fn bands_stay_within_buffers() {
     let on = Interpreted { max_binding: Some(1 << 17), ..interpreted(32, true) };
     assert_eq!(outcome(passes::bands, &on), Ok(()));
 }
 
-/// Vulkan does not say which invocations form a subgroup.
+/// Vulkan does not specify which invocations form a subgroup.
 #[test]
 fn subgroups_may_hold_any_invocations() {
     run_all(Schedule { scattered: true, seed: 6, ..interpreted(32, true).schedule });
 }
 
-/// A frame is all that the program writes: nothing of the last frame is left, whatever splats and
-/// lists it had.
+/// A frame depends only on its program, not on the splats and lists of the last frame.
 #[test]
-fn a_frame_depends_on_nothing_that_was_there_before() {
+fn frame_ignores_previous_buffers() {
     let scratch = &[
         "codes",
         "depth_pairs",
@@ -148,8 +147,8 @@ fn a_frame_depends_on_nothing_that_was_there_before() {
     assert!(unknown.is_empty(), "no pass has buffers named {unknown:?}");
 }
 
-/// Every module that is shipped, with and without native float atomics; workgroups one by one in
-/// either order and many at once; invocations dealt to subgroups in order and at random.
+/// Every shipped module, with and without native float atomics; workgroups one by one in either
+/// order and many at once; invocations assigned to subgroups in order and at random.
 #[test]
 #[ignore = "takes long: tools/test-long"]
 fn every_module_in_every_order() {

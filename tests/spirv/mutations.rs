@@ -1,4 +1,4 @@
-//! Whether faults are found: modules that are shipped, with one thing broken.
+//! Whether faults are detected: shipped modules with one defect.
 use crate::executor::{Change, Interpreted};
 use crate::passes::{self, Scene};
 use crate::{interpreted, outcome};
@@ -8,8 +8,8 @@ use spirv_interpreter::{Order, words as words_of};
 use splatvk::gpu::{Module, shaders};
 use std::sync::Arc;
 
-/// A change of the instructions of one family's modules; it also gets the first id that is free.
-fn changing(family: &'static str, change: fn(&mut Vec<Instruction>, u32)) -> Change {
+/// Changes the instructions of one family's modules; `change` also gets the first free id.
+fn family_change(family: &'static str, change: fn(&mut Vec<Instruction>, u32)) -> Change {
     let modules = shaders::FAMILIES.iter().find(|f| f.name == family).expect("a family").modules;
     Arc::new(move |module: &Module| {
         let known = modules.iter().find(|m| m.name == module.name)?;
@@ -20,11 +20,11 @@ fn changing(family: &'static str, change: fn(&mut Vec<Instruction>, u32)) -> Cha
     })
 }
 
-fn broken(scene: Scene, on: &Interpreted, change: Change) -> String {
+fn fault_of(scene: Scene, on: &Interpreted, change: Change) -> String {
     outcome(scene, &Interpreted { change: Some(change), ..on.clone() }).expect_err("the fault is not found")
 }
 
-/// Every barrier of every module, taken out. `sizes` = those of the subgroups.
+/// Removes every barrier of every module in turn, at each of the subgroup `sizes`.
 pub fn without_barriers(sizes: &[usize]) -> usize {
     let mut removed = 0;
     for &size in sizes {
@@ -41,8 +41,8 @@ pub fn without_barriers(sizes: &[usize]) -> usize {
                     let (name, changed) = (module.name, assemble(&words, &list));
                     let change: Change =
                         Arc::new(move |m: &Module| (m.name == name).then(|| changed.clone()));
-                    let said = broken(scene_of(family.name), &interpreted(size, true), change);
-                    assert!(said.contains("Race"), "{name}, barrier {skipped}: {said}");
+                    let fault = fault_of(scene_of(family.name), &interpreted(size, true), change);
+                    assert!(fault.contains("Race"), "{name}, barrier {skipped}: {fault}");
                     removed += 1;
                 }
             }
@@ -51,7 +51,7 @@ pub fn without_barriers(sizes: &[usize]) -> usize {
     removed
 }
 
-/// The scene that runs a family with barriers.
+/// Scene that runs a family with barriers.
 fn scene_of(family: &str) -> Scene {
     let name = match family {
         "scan_lanes" => "scan",
@@ -65,48 +65,48 @@ fn scene_of(family: &str) -> Scene {
     passes::named(name)
 }
 
-/// The first instruction with an opcode.
+/// First instruction with an opcode.
 fn first(list: &mut [Instruction], op: Op) -> &mut Instruction {
     list.iter_mut().find(|i| i.op == op).expect("the instruction")
 }
 
 #[test]
-fn a_dropped_barrier_is_a_race() {
+fn missing_barrier_is_race() {
     // 2 each of scan_lanes, sort_bases, sort_digits, sort_offsets, ssim_rows_shared and sum, 6 of
     // sort_sweep, 1 of camera_sum and of each degree of project_backward.
     assert_eq!(without_barriers(&[32]), 12 + 6 + 5);
 }
 
-/// As [`a_dropped_barrier_is_a_race`], at every subgroup size.
+/// As [`missing_barrier_is_race`], at every subgroup size.
 #[test]
 #[ignore = "takes long: tools/test-long"]
-fn a_dropped_barrier_is_a_race_at_every_size() {
+fn missing_barrier_is_race_everywhere() {
     assert_eq!(without_barriers(&[4, 8, 16, 32, 64]), 5 * 23);
 }
 
-/// A barrier that orders other memory than the one in question.
+/// A barrier that orders memory of another kind.
 #[test]
-fn a_barrier_of_other_memory_is_a_race() {
-    let change = changing("sum", |list, _| {
+fn barrier_of_other_memory_is_race() {
+    let change = family_change("sum", |list, _| {
         let semantics = first(list, Op::ControlBarrier).words[2];
-        // AcquireRelease | UniformMemory in the place of AcquireRelease | WorkgroupMemory.
+        // AcquireRelease | UniformMemory instead of AcquireRelease | WorkgroupMemory.
         list.iter_mut()
             .filter(|i| i.op == Op::Constant && i.words[1] == semantics)
             .for_each(|i| i.words[2] = 0x48);
     });
-    assert!(broken(passes::named("sum"), &interpreted(32, true), change).contains("Race"));
+    assert!(fault_of(passes::named("sum"), &interpreted(32, true), change).contains("Race"));
 }
 
 #[test]
-fn an_index_beyond_the_end_is_reported() {
-    // Σ of one value more than there are: `i <= count`.
-    let change = changing("sum", |list, _| first(list, Op::ULessThan).op = Op::ULessThanEqual);
-    assert!(broken(passes::named("sum"), &interpreted(32, true), change).contains("Outside"));
+fn index_beyond_end_is_reported() {
+    // Sums one value too many: `i <= count`.
+    let change = family_change("sum", |list, _| first(list, Op::ULessThan).op = Op::ULessThanEqual);
+    assert!(fault_of(passes::named("sum"), &interpreted(32, true), change).contains("Outside"));
 }
 
 #[test]
-fn a_plain_addition_in_the_place_of_an_atomic_one_is_a_race() {
-    let change = changing("sort_digits", |list, free| {
+fn nonatomic_addition_is_race() {
+    let change = family_change("sort_digits", |list, free| {
         let at = list.iter().position(|i| i.op == Op::AtomicIAdd).expect("an atomic addition");
         let [ty, result, pointer, _, _, value] = list[at].words[..] else { panic!("six operands") };
         let plain = [
@@ -116,14 +116,14 @@ fn a_plain_addition_in_the_place_of_an_atomic_one_is_a_race() {
         ];
         list.splice(at..=at, plain);
     });
-    let said = broken(passes::named("sort in one sweep"), &interpreted(32, true), change);
-    assert!(said.contains("sort_digits") && said.contains("Race"), "{said}");
+    let fault = fault_of(passes::named("sort in one sweep"), &interpreted(32, true), change);
+    assert!(fault.contains("sort_digits") && fault.contains("Race"), "{fault}");
 }
 
 #[test]
-fn a_subgroup_operation_that_some_lanes_miss_is_reported() {
+fn divergent_subgroup_operation_is_reported() {
     // Loops end where the counter reaches the lane.
-    let change = changing("raster_forward", |list, _| {
+    let change = family_change("raster_forward", |list, _| {
         let built_in = spirv::BuiltIn::SubgroupLocalInvocationId as u32;
         let decorates = |i: &&Instruction| i.op == Op::Decorate && i.words.get(2) == Some(&built_in);
         let variable = list.iter().find(decorates).expect("the lane").words[0];
@@ -131,74 +131,82 @@ fn a_subgroup_operation_that_some_lanes_miss_is_reported() {
             list.iter().find(|i| i.op == Op::Load && i.words[2] == variable).expect("its load").words[1];
         list.iter_mut().filter(|i| i.op == Op::ULessThan).for_each(|i| i.words[3] = lane);
     });
-    let said = broken(passes::named("colours"), &interpreted(32, true), change);
-    assert!(said.contains("NonUniform"), "{said}");
+    let fault = fault_of(passes::named("colours"), &interpreted(32, true), change);
+    assert!(fault.contains("NonUniform"), "{fault}");
 }
 
 #[test]
-fn shared_memory_that_nobody_wrote_is_reported() {
-    let change = changing("sort_digits", |list, _| {
-        // The counters' zeros are the first store.
+fn unwritten_shared_memory_is_reported() {
+    let change = family_change("sort_digits", |list, _| {
+        // The first store zeroes the counters.
         let at = list.iter().position(|i| i.op == Op::Store).expect("a store");
         list.remove(at);
     });
-    let said = broken(passes::named("sort in one sweep"), &interpreted(32, true), change);
-    assert!(said.contains("Unwritten"), "{said}");
+    let fault = fault_of(passes::named("sort in one sweep"), &interpreted(32, true), change);
+    assert!(fault.contains("Unwritten"), "{fault}");
 }
 
-/// What a program reads of a buffer that it has not written is the last program's.
+/// A program must not read old content of a scratch buffer.
 #[test]
-fn scratch_that_nobody_wrote_is_reported() {
+fn unwritten_scratch_is_reported() {
     let on = Interpreted { scratch: &["scan values"], ..interpreted(32, true) };
     assert!(outcome(passes::named("scan"), &on).expect_err("a fault").contains("Unwritten"));
 }
 
 #[test]
-fn a_variant_for_other_subgroups_is_reported() {
-    // Shuffles reach for lanes that are not there, and lanes of two tiles share a workgroup.
-    let module = |size| {
-        let family = shaders::FAMILIES.iter().find(|f| f.name == "raster_forward").expect("a family");
-        family.modules.iter().find(|m| m.variant == [4] && m.subgroup_size == Some(size)).expect("a module")
-    };
-    let (asked, other) = (module(16).name, words_of(module(32).spirv));
+fn wrong_subgroup_variant_is_reported() {
+    // Shuffles access lanes that do not exist, and lanes of two tiles share a workgroup.
+    let (asked, other) = (raster_module(16).name, words_of(raster_module(32).spirv));
     let change: Change = Arc::new(move |m: &Module| (m.name == asked).then(|| other.clone()));
-    let said = broken(passes::named("colours"), &interpreted(16, true), change);
-    assert!(said.contains("AbsentLane") || said.contains("Race"), "{said}");
+    let fault = fault_of(passes::named("colours"), &interpreted(16, true), change);
+    assert!(fault.contains("AbsentLane") || fault.contains("Race"), "{fault}");
 }
 
-/// A tile of the one-sweep sort looks for what those before it tell. It takes its number when it
-/// starts, so that they have started too; with the number of the workgroup they may come later, one
-/// at a time: it counts for itself then. With more patience it would wait for ever.
+fn raster_module(subgroup_size: u32) -> &'static Module {
+    let family = shaders::FAMILIES.iter().find(|f| f.name == "raster_forward").expect("a family");
+    family
+        .modules
+        .iter()
+        .find(|m| m.variant == [4] && m.subgroup_size == Some(subgroup_size))
+        .expect("a module")
+}
+
+/// A tile of the one-sweep sort looks back at the tiles before it. A tile takes its number when it
+/// starts, so that these have started, too. With the workgroup's number they may start later, one
+/// at a time: the tile then counts for itself. With an unlimited number of retries it would wait
+/// for ever.
 #[test]
-fn reliance_on_the_order_of_workgroups_is_reported() {
+fn workgroup_order_dependence_is_reported() {
     let scene = passes::named("sort in one sweep");
-    let run = |order| {
-        let mut on = interpreted(32, true);
-        (on.schedule.order, on.schedule.in_flight) = (order, 1);
-        on
-    };
     for order in [Order::Falling, Order::Rising] {
-        assert_eq!(outcome(scene, &run(order)), Ok(()));
-        let change = Some(changing("sort_sweep", number_by_workgroup));
-        assert_eq!(outcome(scene, &Interpreted { change, ..run(order) }), Ok(()));
+        assert_eq!(outcome(scene, &one_at_a_time(order)), Ok(()));
+        let change = Some(family_change("sort_sweep", number_by_workgroup));
+        assert_eq!(outcome(scene, &Interpreted { change, ..one_at_a_time(order) }), Ok(()));
     }
-    let patient = changing("sort_sweep", |list, free| {
+    let spinning = family_change("sort_sweep", |list, free| {
         number_by_workgroup(list, free);
-        wait_for_ever(list);
+        spin_for_ever(list);
     });
-    let said = broken(scene, &run(Order::Falling), patient);
-    assert!(said.contains("waits for another workgroup"), "{said}");
+    let fault = fault_of(scene, &one_at_a_time(Order::Falling), spinning);
+    assert!(fault.contains("waits for another workgroup"), "{fault}");
 }
 
-/// `PATIENCE` of the largest number.
-fn wait_for_ever(list: &mut [Instruction]) {
-    let patience = |i: &&mut Instruction| i.op == Op::Constant && i.words[2..] == [1000];
-    let found: Vec<&mut Instruction> = list.iter_mut().filter(patience).collect();
-    assert_eq!(found.len(), 1, "PATIENCE");
+/// Device that runs one workgroup at a time.
+fn one_at_a_time(order: Order) -> Interpreted {
+    let mut on = interpreted(32, true);
+    (on.schedule.order, on.schedule.in_flight) = (order, 1);
+    on
+}
+
+/// Sets `MAX_SPINS` to the largest number.
+fn spin_for_ever(list: &mut [Instruction]) {
+    let max_spins = |i: &&mut Instruction| i.op == Op::Constant && i.words[2..] == [1000];
+    let found: Vec<&mut Instruction> = list.iter_mut().filter(max_spins).collect();
+    assert_eq!(found.len(), 1, "MAX_SPINS");
     found.into_iter().for_each(|constant| constant.words[2] = u32::MAX);
 }
 
-/// `begun = gl_WorkGroupID.x` in the place of `begun = atomicAdd(tiles[0], 1)`.
+/// `begun = gl_WorkGroupID.x` instead of `begun = atomicAdd(tiles[0], 1)`.
 fn number_by_workgroup(list: &mut Vec<Instruction>, free: u32) {
     let [variable, chain] = [free, free + 1];
     let vector =

@@ -1,5 +1,5 @@
-//! Whether the comparisons with the CPU references notice a wrong operation: modules that are shipped,
-//! with one operation in the place of another, as a slip of the hand would have it.
+//! Whether the comparisons with the CPU references detect a wrong operation: shipped modules with
+//! one operation replaced, as by a typing error.
 use crate::executor::{Change, Interpreted};
 use crate::passes::{self, Scene};
 use crate::{interpreted, outcome};
@@ -9,7 +9,7 @@ use spirv_interpreter::{Random, words as words_of};
 use splatvk::gpu::{Module, shaders};
 use std::sync::Arc;
 
-/// An operation and the one that takes its place. Each also stands for its way back.
+/// Pairs of operations that replace each other.
 const SWAPS: [(Op, Op); 9] = [
     (Op::FAdd, Op::FSub),
     (Op::FMul, Op::FDiv),
@@ -21,17 +21,16 @@ const SWAPS: [(Op, Op); 9] = [
     (Op::BitwiseAnd, Op::BitwiseOr),
     (Op::ShiftLeftLogical, Op::ShiftRightLogical),
 ];
-/// The same of GLSL.std.450: smallest and largest of floats, of unsigned and of signed numbers.
+/// Pairs of GLSL.std.450: minimum and maximum of floats, of unsigned and of signed integers.
 const EXTREMES: [(u32, u32); 3] = [(37, 40), (38, 41), (39, 42)];
 
-/// Operations that are exchanged in every module.
+/// Operations that are replaced in every module.
 const EACH: usize = 8;
-/// Percent that must be noticed: 82 are (docs/internals/trust.md#shaders-without-a-device), and a
-/// changed shader draws other operations. What is not noticed has no effect in scenes so small, or
-/// none at all, such as a bound that the next line tests again.
+/// Percent that must be detected: 82 are (docs/internals/trust.md#shaders-without-a-device), and a
+/// changed shader draws other operations. The others have no effect in scenes so small, or no
+/// effect at all, such as a bound that the next line tests again.
 const LEAST: usize = 77;
-/// Subgroups of the size that the device at hand has, so that the modules are those of the other
-/// tests.
+/// Subgroup size of the available device, so that the modules are those of the other tests.
 const SUBGROUP: usize = 8;
 
 fn swapped(i: &Instruction) -> Option<Instruction> {
@@ -53,7 +52,7 @@ fn swapped(i: &Instruction) -> Option<Instruction> {
     Some(Instruction { op, ..i.clone() })
 }
 
-/// A module with one operation exchanged, and what it was.
+/// Modules with one operation replaced, and descriptions of the replacements.
 fn mutants(module: &Module) -> Vec<(String, Vec<u32>)> {
     let words = words_of(module.spirv);
     let list = instructions(&words);
@@ -70,7 +69,7 @@ fn mutants(module: &Module) -> Vec<(String, Vec<u32>)> {
     made
 }
 
-/// The scenes that run a module, and the modules that are run at all.
+/// Modules that run, with the scenes that run them.
 fn runs() -> Vec<(&'static Module, Vec<Scene>)> {
     let scenes = passes::PLAIN.iter().chain(passes::ADDING).map(|(_, scene)| {
         let on = interpreted(SUBGROUP, true);
@@ -79,14 +78,14 @@ fn runs() -> Vec<(&'static Module, Vec<Scene>)> {
     });
     let scenes: Vec<_> = scenes.collect();
     let modules = shaders::FAMILIES.iter().filter(|f| !f.name.starts_with("bench")).flat_map(|f| f.modules);
-    let with = |m: &'static Module| {
+    let with_scenes = |m: &'static Module| {
         let own = scenes.iter().filter(|(_, ran)| ran.contains(m.name)).map(|(scene, _)| *scene);
         (m, own.collect::<Vec<_>>())
     };
-    modules.map(with).filter(|(_, scenes)| !scenes.is_empty()).collect()
+    modules.map(with_scenes).filter(|(_, scenes)| !scenes.is_empty()).collect()
 }
 
-fn is_noticed(name: &'static str, changed: Vec<u32>, scenes: &[Scene]) -> bool {
+fn is_detected(name: &'static str, changed: Vec<u32>, scenes: &[Scene]) -> bool {
     let change: Change = Arc::new(move |m: &Module| (m.name == name).then(|| changed.clone()));
     let on = Interpreted { change: Some(change), ..interpreted(SUBGROUP, true) };
     scenes.iter().any(|scene| outcome(*scene, &on).is_err())
@@ -94,7 +93,7 @@ fn is_noticed(name: &'static str, changed: Vec<u32>, scenes: &[Scene]) -> bool {
 
 #[test]
 #[ignore = "takes long: tools/test-long"]
-fn a_wrong_operation_is_noticed() {
+fn replaced_operation_is_detected() {
     let (mut all, mut noticed) = (0, 0);
     for (module, scenes) in runs() {
         let mut missed = Vec::new();
@@ -102,7 +101,7 @@ fn a_wrong_operation_is_noticed() {
         all += mutants.len();
         let of = mutants.len();
         for (what, changed) in mutants {
-            if !is_noticed(module.name, changed, &scenes) {
+            if !is_detected(module.name, changed, &scenes) {
                 missed.push(what);
             }
         }

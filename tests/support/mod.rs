@@ -14,7 +14,7 @@ use splatvk::pass::{
 use splatvk::scene::seeded;
 use splatvk::scene::{Camera, Splats};
 
-/// A scene with everything a render needs.
+/// Scene with all inputs of a render.
 pub struct Scene {
     pub splats: Splats,
     pub features: Vec<f32>,
@@ -23,13 +23,13 @@ pub struct Scene {
     pub options: RasterOptions,
 }
 
-/// What the GPU rendered.
+/// Planes that the GPU rendered.
 pub struct Rendered {
     pub planes: Vec<f32>,
     pub transmittance: Vec<f32>,
 }
 
-/// Gradients as the GPU computed them.
+/// Gradients that the GPU computed.
 #[derive(PartialEq, Debug)]
 pub struct GpuGradients {
     pub splats: Splats,
@@ -103,7 +103,7 @@ impl Scene {
         GpuGradients { splats, features, camera: raster.frame().camera_grad.read().unwrap() }
     }
 
-    pub fn twin_gradients(&self, forward: &Forward, upstream: &[f32]) -> Gradients {
+    pub fn reference_gradients(&self, forward: &Forward, upstream: &[f32]) -> Gradients {
         let upstream: Vec<f64> = upstream.iter().map(|&g| g.into()).collect();
         let mode = self.options.feature_mode;
         reference::backward(&self.params(), &self.view, mode, &Cutoffs::STANDARD, forward, &upstream)
@@ -142,7 +142,7 @@ pub fn assert_class(name: &str, actual: &[f32], reference: &[f64]) {
 #[track_caller]
 pub fn assert_gradients(scene: &Scene, actual: &GpuGradients, seed: u64) {
     let forward = scene.reference();
-    let reference = scene.twin_gradients(&forward, &scene.upstream(seed));
+    let reference = scene.reference_gradients(&forward, &scene.upstream(seed));
     let p = &reference.params;
     let flat = |v: &[[f32; 3]]| v.as_flattened().to_vec();
     let wide = |v: &[glam::DVec3]| v.iter().flat_map(|x| x.to_array()).collect::<Vec<f64>>();
@@ -200,20 +200,14 @@ pub fn in_bands(
     (image, GpuGradients { splats, features, camera }, bands.count())
 }
 
-/// The lists of both groupings are equal and hold those of the reference, nearest first; how many
-/// entries the reference has, and how many more there are.
+/// Compares the lists of both groupings, which must be equal and contain those of the reference,
+/// nearest first. Returns the number of entries of the reference, and of additional entries.
 #[track_caller]
 pub fn assert_lists(device: &Device, scene: &Scene) -> (usize, usize) {
     let forward = scene.reference();
     let expected = bin::reference(&forward.projected, &forward.order, scene.view.size);
-    let lists = |grouping| {
-        let (params, mut raster) =
-            scene.upload_for(device, DeviceChoices { grouping, ..DeviceChoices::of(device) });
-        raster.forward(&params, &scene.options).unwrap();
-        raster.tile_lists().unwrap()
-    };
-    let counted = lists(TileBinning::Counting);
-    assert_eq!(counted, lists(TileBinning::Sorting));
+    let counted = tile_lists(scene, device, TileBinning::Counting);
+    assert_eq!(counted, tile_lists(scene, device, TileBinning::Sorting));
     assert_eq!(counted.len(), expected.len());
     let mut extra = 0;
     for (list, expected) in counted.iter().zip(&expected) {
@@ -222,4 +216,11 @@ pub fn assert_lists(device: &Device, scene: &Scene) -> (usize, usize) {
         extra += list.len() - expected.len();
     }
     (expected.iter().map(Vec::len).sum(), extra)
+}
+
+fn tile_lists(scene: &Scene, device: &Device, grouping: TileBinning) -> Vec<Vec<u32>> {
+    let (params, mut raster) =
+        scene.upload_for(device, DeviceChoices { grouping, ..DeviceChoices::of(device) });
+    raster.forward(&params, &scene.options).unwrap();
+    raster.tile_lists().unwrap()
 }

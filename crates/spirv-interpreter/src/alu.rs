@@ -1,4 +1,4 @@
-//! What scalar operations compute. Results that the specification leaves undefined are [`GARBAGE`].
+//! Scalar operations. Results that the specification leaves undefined are [`GARBAGE`].
 use crate::code::{Binary, GARBAGE, Unary};
 
 fn f(word: u32) -> f32 {
@@ -27,7 +27,7 @@ fn unorm(half: u32) -> u32 {
     ((half & 0xFFFF) as f32 / 65535.0).to_bits()
 }
 
-/// One operation for all active lanes. The operation is chosen outside the loop.
+/// Applies one operation to all active lanes. The operation is chosen outside the loop.
 macro_rules! each {
     ($lanes:expr, $size:expr, $regs:expr, $to:expr, |$($x:ident = $reg:tt),+| $value:expr) => {
         for &lane in $lanes {
@@ -152,7 +152,7 @@ pub fn binary(op: Binary, lanes: &[usize], size: usize, regs: &mut [u32], to: u3
     }
 }
 
-/// The sign of the divisor.
+/// Remainder with the sign of the divisor.
 fn signed_modulo(x: i32, y: i32) -> u32 {
     match x.checked_rem(y) {
         None => GARBAGE,

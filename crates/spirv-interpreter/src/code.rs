@@ -1,13 +1,13 @@
-//! What a module is lowered to: scalar operations on registers, in blocks.
+//! Lowered form of a module: scalar operations on registers, in blocks.
 //!
 //! A register holds one 32-bit word for every invocation of a subgroup. A vector, a matrix or a
-//! structure is a list of registers, so taking it apart and putting it together costs nothing.
-//! Booleans are 0 or 1.
+//! structure is a list of registers, so extracting and composing parts costs nothing. Booleans are
+//! 0 or 1.
 use spirv::BuiltIn;
 
 pub type Reg = u32;
 
-/// Stands for a value that the specification leaves undefined: a NaN, and a very large integer.
+/// Replaces a value that the specification leaves undefined: a NaN, and a very large integer.
 pub const GARBAGE: u32 = 0xFFC0_DEAD;
 
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -80,7 +80,7 @@ pub enum Binary {
     SLess,
     SLessEqual,
     FEqual,
-    /// Unequal, or not to be compared.
+    /// Unequal or unordered.
     FNotEqual,
     FLess,
     FLessEqual,
@@ -94,7 +94,7 @@ pub enum Reduction {
     UMax,
 }
 
-/// What invocations of a subgroup do together.
+/// Operations between the invocations of a subgroup.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Subgroup {
     All,
@@ -126,20 +126,20 @@ pub enum Atomic {
     FAdd,
 }
 
-/// The variable that a pointer leads into; logical addressing makes it known beforehand.
+/// Variable that a pointer leads into; with logical addressing it is known statically.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Root {
-    /// Storage buffer by binding number.
+    /// Storage buffer, by binding number.
     Buffer(u32),
-    /// Workgroup memory from a word on.
+    /// Workgroup memory, from a word on.
     Shared(u32),
-    /// `Private` or `Function` memory of an invocation from a word on.
+    /// `Private` or `Function` memory of an invocation, from a word on.
     Private(u32),
     Push,
     Input(BuiltIn),
 }
 
-/// A root, and the register with the word in it if that is not 0.
+/// A root, and the register with the word offset if that is not 0.
 #[derive(Clone, Copy, Debug)]
 pub struct Place {
     pub root: Root,
@@ -151,8 +151,7 @@ pub struct Place {
 pub struct Step {
     pub index: Reg,
     pub stride: u32,
-    /// Number of elements; `Err` for an array up to the end of its buffer, with the word where it
-    /// begins.
+    /// Number of elements; `Err` for a runtime array, with the word at which it begins.
     pub count: Result<u32, u32>,
 }
 
@@ -163,7 +162,7 @@ pub enum Inst {
     Fma(Reg, Reg, Reg, Reg),
     Select(Reg, Reg, Reg, Reg),
     PackUnorm4(Reg, [Reg; 4]),
-    /// The register of a list that an index says.
+    /// Register of a list, by index.
     Pick(Reg, Reg, Vec<Reg>),
     Address {
         to: Reg,
@@ -171,7 +170,7 @@ pub enum Inst {
         fixed: u32,
         steps: Vec<Step>,
     },
-    /// To consecutive registers.
+    /// Loads into consecutive registers.
     Load {
         to: Reg,
         place: Place,
@@ -190,17 +189,17 @@ pub enum Inst {
         expected: Reg,
     },
     Subgroup(Subgroup, Reg, Reg, Reg),
-    /// `barrier()`; the memory semantics say which memory it orders.
+    /// `barrier()`; the memory semantics state which memory it orders.
     Barrier {
         semantics: u32,
     },
 }
 
-/// The way to another block, with what its phis take.
+/// Edge to another block, with the moves of its phis.
 #[derive(Clone, Debug)]
 pub struct Edge {
     pub block: u32,
-    /// (phi, source), all at once.
+    /// (phi, source), all performed at once.
     pub moves: Vec<(Reg, Reg)>,
 }
 
@@ -214,14 +213,14 @@ pub enum End {
 
 #[derive(Clone, Debug)]
 pub struct Block {
-    /// Each with the word of the module where it stands.
+    /// Instructions, each with its word offset in the module.
     pub insts: Vec<(Inst, u32)>,
     pub end: End,
 }
 
-/// A module ready to run.
+/// An executable module.
 pub struct Code {
-    /// In an order in which what a construct merges to follows all of it, the entry first.
+    /// In structured order: a merge block follows all blocks of its construct; the entry is first.
     pub blocks: Vec<Block>,
     pub registers: u32,
     pub constants: Vec<(Reg, u32)>,

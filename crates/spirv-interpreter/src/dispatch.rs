@@ -1,32 +1,32 @@
-//! Scheduling of a dispatch: some workgroups at a time, in any order, each for a slice of its
-//! blocks.
+//! Scheduling of a dispatch: a number of workgroups at a time, in any order, each for a slice of
+//! its blocks.
 use crate::code::Code;
 use crate::faults::Faults;
 use crate::memory::Memory;
 use crate::subgroup::{Dispatch, Group, Stop, Subgroup};
 use spirv::MemorySemantics;
 
-/// The order in which workgroups begin.
+/// Order in which workgroups begin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Order {
     /// At random.
     Random,
     /// By number.
     Rising,
-    /// By number, the last first.
+    /// By number, descending.
     Falling,
 }
 
-/// A way in which a device might run a dispatch.
+/// One possible execution order of a dispatch.
 #[derive(Clone, Copy, Debug)]
 pub struct Schedule {
     /// Invocations per subgroup.
     pub subgroup_size: usize,
-    /// The order in which workgroups begin.
+    /// Order in which workgroups begin.
     pub order: Order,
-    /// Workgroups that have begun and not ended, at most.
+    /// Largest number of workgroups in flight.
     pub in_flight: usize,
-    /// Invocations are dealt to subgroups at random, which Vulkan allows.
+    /// Whether invocations are assigned to subgroups at random, which Vulkan permits.
     pub scattered: bool,
     /// Seed of all random choices.
     pub seed: u64,
@@ -56,11 +56,11 @@ struct Running {
     group: Group,
     subgroups: Vec<Subgroup>,
     stops: Vec<Stop>,
-    /// Lanes one after another, or the other way round.
-    up: bool,
+    /// Whether lanes run in ascending order.
+    ascending: bool,
 }
 
-/// Runs all workgroups; `Err` if something cannot go on.
+/// Runs all workgroups; `Err` if one cannot continue.
 pub(crate) fn run(
     code: &Code,
     buffers: &mut [Option<Memory>],
@@ -118,7 +118,7 @@ fn begin(
     }
     let [x, y, _] = d.groups;
     let mut shared = Memory::empty(d.code.shared_words as usize);
-    // One workgroup: invocations of others never touch it.
+    // Only this workgroup accesses it.
     shared.start(threads);
     let group = Group {
         id: [number % x, number / x % y, number / (x * y)],
@@ -128,24 +128,24 @@ fn begin(
         buffer_epoch: 0,
     };
     let stops = vec![Stop::Slice; subgroups.len()];
-    Running { group, subgroups, stops, up: random.below(2) == 0 }
+    Running { group, subgroups, stops, ascending: random.below(2) == 0 }
 }
 
 impl Running {
-    /// Lets one subgroup go on; whether all have ended.
+    /// Runs one subgroup for a slice; returns whether all have ended.
     fn advance(&mut self, d: &mut Dispatch, random: &mut Random) -> Result<bool, String> {
         let ready: Vec<usize> = (0..self.stops.len()).filter(|&k| self.stops[k] == Stop::Slice).collect();
         if ready.is_empty() {
-            return self.meet();
+            return self.pass_barrier();
         }
         let k = ready[random.below(ready.len())];
         let blocks = 1 + random.below(200) as u32;
-        self.stops[k] = self.subgroups[k].run(d, &mut self.group, blocks, self.up)?;
+        self.stops[k] = self.subgroups[k].run(d, &mut self.group, blocks, self.ascending)?;
         Ok(self.stops.iter().all(|s| *s == Stop::Done))
     }
 
-    /// All subgroups have come to a barrier, or have ended.
-    fn meet(&mut self) -> Result<bool, String> {
+    /// Handles a barrier that all subgroups have reached; an error if some have not.
+    fn pass_barrier(&mut self) -> Result<bool, String> {
         let Some(Stop::Barrier { at, semantics }) = self.stops.first().copied() else {
             return Err("a barrier that some subgroups never reach".to_owned());
         };

@@ -1,4 +1,4 @@
-//! Faults, each kind once per instruction.
+//! Record of faults, each kind once per instruction.
 use crate::memory::AccessFault;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -9,13 +9,13 @@ use std::fmt;
 pub enum Fault {
     /// An index beyond the end of a buffer, an array or a vector.
     Outside,
-    /// A read of a word that nothing has written.
+    /// A read of an unwritten word.
     Unwritten,
-    /// Two invocations access a word, at least one writes, and nothing orders them.
+    /// Two unordered accesses to a word by different invocations, at least one of them a write.
     Race,
     /// A subgroup operation in which not all invocations of the subgroup take part.
     NonUniform,
-    /// A shuffle from a lane that does not take part.
+    /// A shuffle from an inactive lane.
     AbsentLane,
 }
 
@@ -31,7 +31,7 @@ impl From<AccessFault> for Fault {
 /// A fault and its instruction.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Found {
-    /// Word of the module at which the instruction begins.
+    /// Offset of the instruction in the module, words.
     pub at: u32,
     /// Its kind.
     pub fault: Fault,
@@ -43,9 +43,10 @@ pub struct Found {
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Error {
-    /// It cannot go on: a barrier that some invocations never reach, or a wait without end.
+    /// The dispatch cannot continue: a barrier that some invocations never reach, or a wait without
+    /// end.
     Stuck(String),
-    /// It ended, with faults.
+    /// The dispatch ended, with faults.
     Faulty(Vec<Found>),
 }
 
@@ -69,12 +70,12 @@ pub struct Faults {
 }
 
 impl Faults {
-    /// Notes a fault of the instruction at a word of the module.
+    /// Records a fault of the instruction at a word of the module.
     pub fn note(&mut self, at: u32, kind: Fault, detail: impl FnOnce() -> String) {
         self.found.entry((at, kind)).or_insert_with(detail);
     }
 
-    /// All of them, in the order of the module.
+    /// All faults, in the order of the module.
     pub fn report(self) -> Result<(), Error> {
         if self.found.is_empty() {
             return Ok(());

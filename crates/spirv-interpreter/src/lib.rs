@@ -1,12 +1,12 @@
-//! Interprets SPIR-V compute shaders, for tests.
+//! Interpreter of SPIR-V compute shaders, for tests.
 //!
-//! A device has one subgroup size and one scheduler. This interpreter takes any subgroup size and
-//! any order of workgroups, and reports faults that no driver reports:
+//! A device has one subgroup size and one scheduler. This interpreter supports any subgroup size
+//! and any order of workgroups, and reports faults that no driver reports:
 //!
 //! - **data races**, between invocations and between workgroups, by the memory model of Vulkan;
-//! - **reads of unwritten words**, in buffers that start empty, in workgroup and private memory;
+//! - **reads of unwritten words**, in initially empty buffers, workgroup and private memory;
 //! - **accesses out of bounds** of buffers, arrays and vectors;
-//! - **subgroup operations** in which not all invocations take part, and shuffles from absent
+//! - **subgroup operations** in which not all invocations take part, and shuffles from inactive
 //!   lanes;
 //! - **barriers** that some invocations never reach, and waits that never end.
 //!
@@ -16,7 +16,7 @@
 //! # fn main() -> Result<(), spirv_interpreter::Error> {
 //! # let spirv = std::fs::read("double.spv").unwrap_or_default();
 //! let shader = Shader::new(&words(&spirv));
-//! // Binding 0 holds two floats.
+//! // Binding 0 contains two floats.
 //! let mut buffers = vec![Some(Memory::of(vec![1f32.to_bits(), 2f32.to_bits()]))];
 //! let schedule = Schedule {
 //!     subgroup_size: 16,
@@ -36,11 +36,10 @@
 //! Compute shaders for Vulkan with logical addressing and 32-bit numbers: storage buffers of
 //! descriptor set 0, push constants, workgroup and private memory, atomics, subgroup vote, ballot,
 //! shuffle and arithmetic, most of GLSL.std.450. No images, no other number widths, no functions
-//! that the compiler has not inlined. A module that uses something else makes [`Shader::new`] panic
-//! with its name: this is a test tool, and a panic fails a test.
+//! that the compiler has not inlined. For other modules [`Shader::new`] panics with the name of the
+//! unsupported feature: this is a test tool, and a panic fails a test.
 //!
-//! [`module`] takes modules apart and puts them together again, to break one instruction and see
-//! whether tests notice.
+//! [`module`] disassembles and reassembles modules, for mutation tests of single instructions.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
 
 mod alu;
@@ -52,7 +51,7 @@ mod lower_alu;
 mod memory;
 pub mod module;
 mod subgroup;
-mod together;
+mod subgroup_ops;
 mod types;
 
 pub use code::GARBAGE;
@@ -60,19 +59,19 @@ pub use dispatch::{Order, Random, Schedule};
 pub use faults::{Error, Fault, Found};
 pub use memory::Memory;
 
-/// The little-endian words of a SPIR-V file or a buffer.
+/// Little-endian words of a SPIR-V file or a buffer.
 pub fn words(bytes: &[u8]) -> Vec<u32> {
     bytes.chunks_exact(4).map(|c| u32::from_le_bytes([c[0], c[1], c[2], c[3]])).collect()
 }
 
-/// A shader, ready to run.
+/// An executable shader.
 pub struct Shader(code::Code);
 
 impl Shader {
     /// Reads a module with one entry point.
     ///
     /// # Panics
-    /// If the module is invalid or uses something that is not supported; the message names it.
+    /// If the module is invalid or uses an unsupported feature; the message names it.
     pub fn new(spirv: &[u32]) -> Shader {
         Shader(lower::lower(spirv))
     }
@@ -82,7 +81,8 @@ impl Shader {
         self.0.workgroup
     }
 
-    /// Runs all workgroups. `buffers` by binding number, `push` the words of the push constants.
+    /// Runs all workgroups. `buffers` are indexed by binding number; `push` has the words of the
+    /// push constants.
     ///
     /// # Errors
     /// [`Error::Stuck`] if a barrier is not reached by all or a loop never ends, [`Error::Faulty`]

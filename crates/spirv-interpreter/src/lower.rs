@@ -1,5 +1,5 @@
-//! The body of a module to [`Code`]: blocks, memory, atomics, what subgroups do. Arithmetic is in
-//! `lower_alu.rs`.
+//! Lowering of a module to [`Code`]: blocks, memory, atomics and subgroup operations. Arithmetic is
+//! in `lower_alu.rs`.
 use crate::code::{
     Atomic, Block, Code, Edge, End, GARBAGE, Inst, Place, Reduction, Reg, Root, Step, Subgroup,
 };
@@ -12,7 +12,7 @@ pub struct Lowering {
     pub module: Module,
     /// Type and registers of every value.
     pub values: HashMap<u32, (u32, Vec<Reg>)>,
-    /// Every pointer, and the type that it points to.
+    /// Every pointer, with the type of its target.
     places: HashMap<u32, (Place, u32)>,
     registers: Reg,
     constants: Vec<(Reg, u32)>,
@@ -23,7 +23,7 @@ pub struct Lowering {
 }
 
 /// A block of the module before its phis are resolved.
-struct Raw {
+struct RawBlock {
     label: u32,
     phis: Vec<Instruction>,
     insts: Vec<(Inst, u32)>,
@@ -54,7 +54,7 @@ pub fn lower(words: &[u32]) -> Code {
     let order = structured_order(&raw);
     let number: HashMap<u32, u32> =
         order.iter().enumerate().map(|(k, &b)| (raw[b].label, k as u32)).collect();
-    let phis: HashMap<u32, &Raw> = raw.iter().map(|b| (b.label, b)).collect();
+    let phis: HashMap<u32, &RawBlock> = raw.iter().map(|b| (b.label, b)).collect();
     let blocks = order.iter().map(|&b| l.finish(&raw[b], &number, &phis)).collect();
     Code {
         blocks,
@@ -66,9 +66,9 @@ pub fn lower(words: &[u32]) -> Code {
     }
 }
 
-/// Blocks such that all of a construct comes before its merge block: reverse post-order of a walk
-/// that goes to merge blocks first and to continue targets next.
-fn structured_order(raw: &[Raw]) -> Vec<usize> {
+/// Blocks in structured order, in which all of a construct precedes its merge block: reverse
+/// post-order of a depth-first walk that visits merge blocks first and continue targets next.
+fn structured_order(raw: &[RawBlock]) -> Vec<usize> {
     let index: HashMap<u32, usize> = raw.iter().enumerate().map(|(k, b)| (b.label, k)).collect();
     let next = |b: usize| -> Vec<usize> {
         let targets = match raw[b].end.op {
@@ -120,16 +120,16 @@ impl Lowering {
         self.value(id)[0]
     }
 
-    /// Registers for a result.
+    /// Allocates registers for a result.
     pub fn result(&mut self, i: &Instruction) -> Vec<Reg> {
         let count = self.module.types.scalars(i.words[0]);
         let regs = self.registers(count);
-        self.name(i, regs.clone());
+        self.assign(i, regs.clone());
         regs
     }
 
-    /// Says which registers a result is.
-    pub fn name(&mut self, i: &Instruction, regs: Vec<Reg>) {
+    /// Assigns registers to a result.
+    pub fn assign(&mut self, i: &Instruction, regs: Vec<Reg>) {
         self.values.insert(i.words[1], (i.words[0], regs));
     }
 
@@ -168,7 +168,7 @@ impl Lowering {
         }
     }
 
-    fn blocks(&mut self, body: &[Instruction]) -> Vec<Raw> {
+    fn blocks(&mut self, body: &[Instruction]) -> Vec<RawBlock> {
         let mut blocks = Vec::new();
         let (mut label, mut phis, mut merges) = (0, Vec::new(), Vec::new());
         for i in body {
@@ -182,7 +182,7 @@ impl Lowering {
                 Op::SelectionMerge => merges.push(i.words[0]),
                 Op::LoopMerge => merges.extend(&i.words[..2]),
                 Op::Branch | Op::BranchConditional | Op::Switch | Op::Return | Op::Unreachable => {
-                    blocks.push(Raw {
+                    blocks.push(RawBlock {
                         label,
                         phis: std::mem::take(&mut phis),
                         insts: std::mem::take(&mut self.out),
@@ -196,8 +196,8 @@ impl Lowering {
         blocks
     }
 
-    /// A block with its end, now that every value has registers.
-    fn finish(&self, raw: &Raw, number: &HashMap<u32, u32>, all: &HashMap<u32, &Raw>) -> Block {
+    /// Completes a block with its end, once every value has registers.
+    fn finish(&self, raw: &RawBlock, number: &HashMap<u32, u32>, all: &HashMap<u32, &RawBlock>) -> Block {
         let edge = |to: u32| {
             let mut moves = Vec::new();
             for phi in &all[&to].phis {
@@ -228,25 +228,25 @@ impl Lowering {
             Op::Load => {
                 let (place, ty) = self.places[&w[2]];
                 let mut words = Vec::new();
-                self.module.types.places(ty, 0, &mut words);
+                self.module.types.word_offsets(ty, 0, &mut words);
                 let to = self.result(i)[0];
                 self.push(Inst::Load { to, place, words });
             }
             Op::Store => self.store(w[0], w[1]),
-            // Execution and memory scope are constants too; shaders have barriers of the whole
+            // Execution and memory scope are constants, too; shaders have barriers of the whole
             // workgroup only.
             Op::ControlBarrier => {
-                let scope = self.known(w[0]);
+                let scope = self.constant_value(w[0]);
                 assert_eq!(scope, spirv::Scope::Workgroup as u32, "a barrier of a workgroup");
-                self.push(Inst::Barrier { semantics: self.known(w[2]) });
+                self.push(Inst::Barrier { semantics: self.constant_value(w[2]) });
             }
             _ if self.atomic(i) || self.subgroup(i) || self.alu(i) => {}
             other => panic!("{other:?} is not read yet"),
         }
     }
 
-    /// The value of a constant.
-    fn known(&self, id: u32) -> u32 {
+    /// Value of a constant.
+    fn constant_value(&self, id: u32) -> u32 {
         let reg = self.scalar(id);
         self.constants.iter().find(|c| c.0 == reg).expect("a constant").1
     }
@@ -254,7 +254,7 @@ impl Lowering {
     fn store(&mut self, pointer: u32, value: u32) {
         let (place, ty) = self.places[&pointer];
         let mut words = Vec::new();
-        self.module.types.places(ty, 0, &mut words);
+        self.module.types.word_offsets(ty, 0, &mut words);
         let from = self.value(value);
         self.push(Inst::Store { from, place, words });
     }
@@ -264,7 +264,8 @@ impl Lowering {
         let (mut fixed, mut steps) = (0, Vec::new());
         for &index in &w[3..] {
             if let Type::Struct { .. } = self.module.types.get(ty) {
-                let (member, first) = self.module.types.field(ty, self.known(index)).expect("a member");
+                let (member, first) =
+                    self.module.types.field(ty, self.constant_value(index)).expect("a member");
                 (ty, fixed) = (member, fixed + first);
                 continue;
             }
@@ -281,7 +282,7 @@ impl Lowering {
     fn atomic(&mut self, i: &Instruction) -> bool {
         let w = &i.words;
         // Operands: result type and id, pointer, scope, semantics, then the value; a comparison has
-        // one semantics more.
+        // one more semantics operand.
         let (op, value, expected) = match i.op {
             Op::AtomicLoad => (Atomic::Load, None, None),
             Op::AtomicStore => {
@@ -311,7 +312,8 @@ impl Lowering {
         true
     }
 
-    /// Operands: result type and id, scope, then the value, or the operation and the value.
+    /// Lowers a subgroup operation. Operands: result type and id, scope, then the value, or the
+    /// operation and the value.
     fn subgroup(&mut self, i: &Instruction) -> bool {
         let w = &i.words;
         let reduction = match i.op {

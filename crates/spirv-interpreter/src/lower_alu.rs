@@ -1,4 +1,4 @@
-//! Arithmetic to scalar operations; taking composites apart costs nothing.
+//! Lowering of arithmetic to scalar operations; extracting and composing parts costs nothing.
 use crate::code::{Binary, GARBAGE, Inst, Reg, Unary};
 use crate::lower::Lowering;
 use crate::module::Instruction;
@@ -37,41 +37,41 @@ impl Lowering {
         match i.op {
             Op::CompositeConstruct => {
                 let parts = w[2..].iter().flat_map(|id| self.value(*id)).collect();
-                self.name(i, parts);
+                self.assign(i, parts);
             }
             Op::CompositeExtract => {
                 let (first, count) = self.part(w[2], &w[3..]);
                 let regs = self.value(w[2])[first..first + count].to_vec();
-                self.name(i, regs);
+                self.assign(i, regs);
             }
             Op::CompositeInsert => {
                 let (first, count) = self.part(w[3], &w[4..]);
                 let mut regs = self.value(w[3]);
                 regs[first..first + count].copy_from_slice(&self.value(w[2]));
-                self.name(i, regs);
+                self.assign(i, regs);
             }
             Op::VectorShuffle => {
                 let both = [self.value(w[2]), self.value(w[3])].concat();
                 let undefined = self.constant(GARBAGE);
                 let regs = w[4..].iter().map(|k| both.get(*k as usize).copied().unwrap_or(undefined));
                 let regs = regs.collect();
-                self.name(i, regs);
+                self.assign(i, regs);
             }
             Op::CopyObject | Op::Bitcast => {
                 let regs = self.value(w[2]);
-                self.name(i, regs);
+                self.assign(i, regs);
             }
             Op::Undef => {
                 let count = self.module.types.scalars(w[0]);
                 let regs = (0..count).map(|_| self.constant(GARBAGE)).collect();
-                self.name(i, regs);
+                self.assign(i, regs);
             }
             _ => return false,
         }
         true
     }
 
-    /// Scalars before a part of a composite, and how many it has.
+    /// Number of scalars before a part of a composite, and in it.
     fn part(&self, id: u32, path: &[u32]) -> (usize, usize) {
         let (mut first, mut ty) = (0, self.values[&id].0);
         for &index in path {
@@ -99,7 +99,7 @@ impl Lowering {
         self.push(Inst::Binary(Binary::FAdd, to, sum.expect("a vector has components"), zero));
     }
 
-    /// Vectors and matrices; matrices are columns one after another.
+    /// Lowers operations on vectors and matrices; matrices are stored by columns.
     fn linear(&mut self, i: &Instruction) -> bool {
         let w = &i.words;
         if !matches!(
@@ -119,7 +119,7 @@ impl Lowering {
         if i.op == Op::Transpose {
             let (rows, columns) = self.module.types.matrix(self.values[&w[2]].0);
             let regs = (0..rows * columns).map(|k| a[k % columns * rows + k / columns]).collect();
-            self.name(i, regs);
+            self.assign(i, regs);
             return true;
         }
         let b = self.value(w[3]);
@@ -174,7 +174,7 @@ impl Lowering {
                     self.push(Inst::Binary(op, next, sum, part));
                     sum = next;
                 }
-                self.name(i, vec![sum]);
+                self.assign(i, vec![sum]);
             }
             Op::VectorExtractDynamic => {
                 let (from, index) = (self.value(w[2]), self.scalar(w[3]));
@@ -186,7 +186,7 @@ impl Lowering {
         true
     }
 
-    /// Instructions of GLSL.std.450.
+    /// Lowers instructions of GLSL.std.450.
     fn extended(&mut self, i: &Instruction) -> bool {
         if i.op != Op::ExtInst {
             return false;
@@ -277,7 +277,7 @@ fn unary(op: Op) -> Option<Unary> {
     })
 }
 
-/// The operation, and whether its operands change places.
+/// The operation, and whether its operands are swapped.
 fn binary(op: Op) -> Option<(Binary, bool)> {
     let straight = |op| Some((op, false));
     let swapped = |op| Some((op, true));

@@ -1,27 +1,28 @@
-//! Memory that records the accesses of each word, to find unwritten reads and data races.
+//! Memory that records the accesses to each word, to detect unwritten reads and data races.
 //!
-//! Two accesses race if at least one writes, not both are atomic, they are of different
+//! Two accesses race if at least one writes, not both are atomic, they are by different
 //! invocations, and no barrier lies between them. Barriers order the invocations of a workgroup
 //! only, and only the memory that they name. Nothing orders two workgroups of one dispatch.
 use crate::code::{Atomic, GARBAGE};
 
-/// An invocation: its number within the dispatch, from 1, and the barriers that it has passed.
+/// An invocation: its number in the dispatch, from 1, and the number of barriers that it has
+/// passed.
 #[derive(Clone, Copy)]
-pub(crate) struct Who {
+pub(crate) struct Accessor {
     pub invocation: u32,
     pub epoch: u32,
 }
 
-/// A summary of the accesses of one kind to one word. It decides exactly whether any of them is
+/// Summary of the accesses of one kind to one word. It decides exactly whether any of them is
 /// unordered with a later access.
 #[derive(Clone, Copy, Default)]
 struct Seen {
-    /// The latest; invocation 0 = none.
+    /// Of the latest access; invocation 0 = none.
     invocation: u32,
     epoch: u32,
-    /// Several invocations of the latest's workgroup, in the latest's epoch.
+    /// Whether several invocations of that workgroup accessed the word in that epoch.
     many: bool,
-    /// More than one workgroup.
+    /// Whether more than one workgroup accessed the word.
     groups: bool,
 }
 
@@ -42,11 +43,11 @@ pub(crate) enum AccessFault {
 
 const PAGE: usize = 256;
 
-/// The words of a buffer, with their history in the current dispatch.
+/// Words of a buffer, with their access history in the current dispatch.
 pub struct Memory {
     /// The content.
     pub words: Vec<u32>,
-    /// Which words hold something; `None` where all do.
+    /// Whether each word is written; `None` where all are.
     written: Option<Vec<bool>>,
     shadow: Vec<Option<Box<[Shadow; PAGE]>>>,
     group_size: u32,
@@ -66,14 +67,14 @@ impl Memory {
         memory
     }
 
-    /// Marks the words from one on as unwritten.
+    /// Marks all words from `from` on as unwritten.
     pub fn forget(&mut self, from: usize) {
         let count = self.words.len();
         self.words[from..].fill(GARBAGE);
         self.written.get_or_insert_with(|| vec![true; count])[from..].fill(false);
     }
 
-    /// Writes words from outside of a dispatch.
+    /// Writes words outside of a dispatch.
     pub fn set(&mut self, first: usize, words: &[u32]) {
         self.words[first..first + words.len()].copy_from_slice(words);
         if let Some(written) = &mut self.written {
@@ -81,7 +82,7 @@ impl Memory {
         }
     }
 
-    /// Begins a dispatch, ordered after all earlier ones.
+    /// Starts a dispatch, ordered after all earlier ones.
     pub(crate) fn start(&mut self, group_size: u32) {
         self.group_size = group_size;
         self.shadow.fill(None);
@@ -92,21 +93,21 @@ impl Memory {
         &mut page[word % PAGE]
     }
 
-    pub(crate) fn load(&mut self, word: usize, who: Who) -> (u32, Option<AccessFault>) {
+    pub(crate) fn load(&mut self, word: usize, accessor: Accessor) -> (u32, Option<AccessFault>) {
         let size = self.group_size;
         let shadow = self.shadow(word);
-        let race = shadow.written.unordered(who, size) || shadow.atomic.unordered(who, size);
-        shadow.read.note(who, size);
+        let race = shadow.written.unordered(accessor, size) || shadow.atomic.unordered(accessor, size);
+        shadow.read.note(accessor, size);
         let unwritten = self.written.as_ref().is_some_and(|w| !w[word]);
         let fault = if race { Some(AccessFault::Race) } else { unwritten.then_some(AccessFault::Unwritten) };
         (self.words[word], fault)
     }
 
-    pub(crate) fn store(&mut self, word: usize, value: u32, who: Who) -> Option<AccessFault> {
+    pub(crate) fn store(&mut self, word: usize, value: u32, accessor: Accessor) -> Option<AccessFault> {
         let size = self.group_size;
         let shadow = self.shadow(word);
-        let race = [shadow.read, shadow.written, shadow.atomic].iter().any(|s| s.unordered(who, size));
-        shadow.written.note(who, size);
+        let race = [shadow.read, shadow.written, shadow.atomic].iter().any(|s| s.unordered(accessor, size));
+        shadow.written.note(accessor, size);
         self.words[word] = value;
         if let Some(written) = &mut self.written {
             written[word] = true;
@@ -119,49 +120,50 @@ impl Memory {
         op: Atomic,
         word: usize,
         (value, expected): (u32, u32),
-        who: Who,
+        accessor: Accessor,
     ) -> (u32, Option<AccessFault>) {
         let size = self.group_size;
         let shadow = self.shadow(word);
-        let race =
-            shadow.read.unordered(who, size) && op != Atomic::Load || shadow.written.unordered(who, size);
-        shadow.atomic.note(who, size);
+        let race = shadow.read.unordered(accessor, size) && op != Atomic::Load
+            || shadow.written.unordered(accessor, size);
+        shadow.atomic.note(accessor, size);
         let mut unwritten = false;
         if let Some(written) = &mut self.written {
             unwritten = !written[word] && !matches!(op, Atomic::Store | Atomic::Exchange);
             written[word] = true;
         }
         let before = self.words[word];
-        self.words[word] = changed(op, before, value, expected);
+        self.words[word] = updated_word(op, before, value, expected);
         let fault = if race { Some(AccessFault::Race) } else { unwritten.then_some(AccessFault::Unwritten) };
         (before, fault)
     }
 }
 
 impl Seen {
-    fn unordered(&self, who: Who, group_size: u32) -> bool {
+    fn unordered(&self, accessor: Accessor, group_size: u32) -> bool {
         if self.invocation == 0 {
             return false;
         }
-        let other = self.invocation != who.invocation;
-        let same_group = !other || (self.invocation - 1) / group_size == (who.invocation - 1) / group_size;
-        self.groups || !same_group || self.epoch == who.epoch && (other || self.many)
+        let other = self.invocation != accessor.invocation;
+        let same_group =
+            !other || (self.invocation - 1) / group_size == (accessor.invocation - 1) / group_size;
+        self.groups || !same_group || self.epoch == accessor.epoch && (other || self.many)
     }
 
-    fn note(&mut self, who: Who, group_size: u32) {
-        let other = self.invocation != 0 && self.invocation != who.invocation;
-        if other && (self.invocation - 1) / group_size != (who.invocation - 1) / group_size {
+    fn note(&mut self, accessor: Accessor, group_size: u32) {
+        let other = self.invocation != 0 && self.invocation != accessor.invocation;
+        if other && (self.invocation - 1) / group_size != (accessor.invocation - 1) / group_size {
             self.groups = true;
-        } else if self.epoch != who.epoch {
+        } else if self.epoch != accessor.epoch {
             self.many = false;
         } else if other {
             self.many = true;
         }
-        (self.invocation, self.epoch) = (who.invocation, who.epoch);
+        (self.invocation, self.epoch) = (accessor.invocation, accessor.epoch);
     }
 }
 
-fn changed(op: Atomic, before: u32, value: u32, expected: u32) -> u32 {
+fn updated_word(op: Atomic, before: u32, value: u32, expected: u32) -> u32 {
     match op {
         Atomic::Load => before,
         Atomic::Store | Atomic::Exchange => value,

@@ -1,4 +1,4 @@
-//! A module as a list of instructions, to be changed and put together again.
+//! A module as a list of instructions that can be modified and reassembled.
 use crate::types::{Type, Types};
 use spirv::{Decoration, ExecutionMode, Op, StorageClass};
 use std::collections::HashMap;
@@ -10,7 +10,7 @@ pub struct Instruction {
     pub op: Op,
     /// Its operands.
     pub words: Vec<u32>,
-    /// The word of the module at which it begins.
+    /// Offset of the instruction in the module, words.
     pub at: u32,
 }
 
@@ -29,7 +29,7 @@ pub fn instructions(words: &[u32]) -> Vec<Instruction> {
     out
 }
 
-/// The words of a module: the header of another one, and these instructions.
+/// Words of a module: the header of another one, and these instructions.
 pub fn assemble(header: &[u32], list: &[Instruction]) -> Vec<u32> {
     let mut out = header[..5].to_vec();
     for i in list {
@@ -42,7 +42,7 @@ pub fn assemble(header: &[u32], list: &[Instruction]) -> Vec<u32> {
 pub(crate) struct Variable {
     pub id: u32,
     pub class: StorageClass,
-    /// The type that it points to.
+    /// Type of its target.
     pub ty: u32,
     pub initializer: Option<u32>,
 }
@@ -75,7 +75,7 @@ impl Module {
             }
             module.declare(&i);
         }
-        // The optimiser leaves one function; a second one would be seen as its call.
+        // The optimiser leaves one function; a second one would fail at its call.
         module.body = list.take_while(|i| i.op != Op::FunctionEnd).collect();
         module
     }
@@ -131,7 +131,7 @@ impl Module {
         self.constants.insert(w[1], Constant { ty: w[0], words: Some(words) });
     }
 
-    /// `OpVariable`, at module scope or in the function.
+    /// Records an `OpVariable`, at module scope or in the function.
     pub fn variable(&mut self, w: &[u32]) {
         let Type::Pointer { class, to } = *self.types.get(w[0]) else { panic!("a variable is a pointer") };
         self.variables.push(Variable { id: w[1], class, ty: to, initializer: w.get(3).copied() });

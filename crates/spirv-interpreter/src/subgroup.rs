@@ -1,23 +1,23 @@
-//! The invocations of a subgroup in lockstep. Those that went different ways meet again where the
-//! construct merges: the block that stands first in the structured order runs first, with all
-//! invocations that are there.
+//! Execution of the invocations of a subgroup in lockstep. Diverged invocations reconverge at the
+//! merge block: the block that is first in structured order runs first, with all invocations that
+//! are at it.
 use crate::alu;
 use crate::code::{Code, Edge, End, GARBAGE, Inst, Place, Reg, Root, Step};
 use crate::faults::{Fault, Faults};
-use crate::memory::{Memory, Who};
+use crate::memory::{Accessor, Memory};
 use spirv::BuiltIn;
 
-/// Marks the word of a pointer that leads out of its array; the rest is the index.
-pub const OUTSIDE: u32 = 1 << 31;
+/// Marks a pointer out of bounds; the other bits are the index.
+pub const OUT_OF_BOUNDS: u32 = 1 << 31;
 
 /// Block of an invocation that has returned.
 const DONE: u32 = u32::MAX;
 
-/// More blocks than any shader takes in a test, by a factor of ten: a subgroup that runs longer
-/// waits for something that does not come.
+/// Limit of blocks, ten times the largest number of any shader in a test: a subgroup beyond it
+/// waits for an event that does not occur.
 const MOST_BLOCKS: u64 = 1_000_000;
 
-/// What all workgroups of a dispatch see.
+/// Shared state of all workgroups of a dispatch.
 pub struct Dispatch<'a> {
     pub code: &'a Code,
     /// By binding number.
@@ -27,7 +27,7 @@ pub struct Dispatch<'a> {
     pub faults: &'a mut Faults,
 }
 
-/// A workgroup's own: position, memory, and barriers so far by what they order.
+/// State of a workgroup: position, memory, and numbers of barriers by the memory that they order.
 pub struct Group {
     pub id: [u32; 3],
     pub number: u32,
@@ -36,7 +36,7 @@ pub struct Group {
     pub buffer_epoch: u32,
 }
 
-/// Why a subgroup stopped.
+/// Reason of a stop of a subgroup.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Stop {
     Barrier { at: u32, semantics: u32 },
@@ -49,13 +49,13 @@ pub struct Subgroup {
     pub locals: Vec<u32>,
     pub number: u32,
     pub subgroups: u32,
-    /// Lanes that a subgroup of this device has; the last one of a workgroup may be short.
+    /// Lanes per subgroup of this device; the last subgroup of a workgroup may have fewer.
     pub(crate) size: usize,
     pub(crate) regs: Vec<u32>,
     private: Vec<u32>,
     written: Vec<bool>,
     block: Vec<u32>,
-    /// Instruction of the current block, after a barrier.
+    /// Index of the next instruction in the current block; not 0 after a barrier.
     pc: usize,
     pub(crate) active: Vec<usize>,
     blocks: u64,
@@ -85,7 +85,7 @@ impl Subgroup {
         }
     }
 
-    /// Back to the entry, for other invocations.
+    /// Resets the subgroup to the entry, for other invocations.
     pub fn start(&mut self, locals: Vec<u32>, number: u32, subgroups: u32) {
         self.block = vec![0; locals.len()];
         (self.locals, self.number, self.subgroups) = (locals, number, subgroups);
@@ -94,13 +94,13 @@ impl Subgroup {
         self.written.fill(false);
     }
 
-    /// Runs to the next barrier, to the end, or for so many blocks.
+    /// Runs to the next barrier, to the end, or for a number of blocks.
     pub fn run(
         &mut self,
         d: &mut Dispatch,
         group: &mut Group,
         blocks: u32,
-        up: bool,
+        ascending: bool,
     ) -> Result<Stop, String> {
         for _ in 0..blocks {
             let block = self.block.iter().copied().min().unwrap_or(DONE);
@@ -114,7 +114,7 @@ impl Subgroup {
                 }
                 self.active.clear();
                 self.active.extend((0..self.block.len()).filter(|&l| self.block[l] == block));
-                if !up {
+                if !ascending {
                     self.active.reverse();
                 }
             }
@@ -214,7 +214,7 @@ impl Subgroup {
             Inst::Load { to, place, words } => self.load(*to, *place, words, at, d, group),
             Inst::Store { from, place, words } => self.store(from, *place, words, at, d, group),
             Inst::Atomic { .. } => self.atomic(inst, at, d, group),
-            Inst::Subgroup(op, to, a, b) => self.together(*op, *to, (*a, *b), at, d.faults),
+            Inst::Subgroup(op, to, a, b) => self.subgroup_op(*op, *to, (*a, *b), at, d.faults),
             Inst::Barrier { .. } => {}
         }
     }
@@ -235,13 +235,13 @@ impl Subgroup {
         for k in 0..self.active.len() {
             let lane = self.active[k];
             let mut word = place.word.map_or(0, |reg| self.get(reg, lane));
-            if word & OUTSIDE == 0 {
+            if word & OUT_OF_BOUNDS == 0 {
                 word += fixed;
                 for step in steps {
                     let index = self.get(step.index, lane);
                     let count = step.count.unwrap_or_else(|first| whole.saturating_sub(first) / step.stride);
                     if index >= count {
-                        word = OUTSIDE | index.min(OUTSIDE - 1);
+                        word = OUT_OF_BOUNDS | index.min(OUT_OF_BOUNDS - 1);
                         break;
                     }
                     word += index * step.stride;
@@ -251,19 +251,19 @@ impl Subgroup {
         }
     }
 
-    fn who(&self, lane: usize, group: &Group, d: &Dispatch, root: Root) -> Who {
+    fn accessor(&self, lane: usize, group: &Group, d: &Dispatch, root: Root) -> Accessor {
         let [x, y, z] = d.code.workgroup;
         let epoch = match root {
             Root::Shared(_) => group.shared_epoch,
             _ => group.buffer_epoch,
         };
-        Who { invocation: 1 + group.number * x * y * z + self.locals[lane], epoch }
+        Accessor { invocation: 1 + group.number * x * y * z + self.locals[lane], epoch }
     }
 
-    /// Where a pointer leads; `None` after a fault.
+    /// Word offset of a pointer; `None` after a fault.
     fn word(&self, place: Place, lane: usize, at: u32, faults: &mut Faults) -> Option<u32> {
         let word = place.word.map_or(0, |reg| self.get(reg, lane));
-        if word & OUTSIDE == 0 {
+        if word & OUT_OF_BOUNDS == 0 {
             return Some(word);
         }
         faults.note(at, Fault::Outside, || format!("{:?}, index {}", place.root, word as i32 & i32::MAX));
@@ -277,7 +277,7 @@ impl Subgroup {
                 (0..words.len() as u32).for_each(|n| self.set(to + n, lane, GARBAGE));
                 continue;
             };
-            let who = self.who(lane, group, d, place.root);
+            let accessor = self.accessor(lane, group, d, place.root);
             for (n, &word) in words.iter().enumerate() {
                 let word = (first + word) as usize;
                 let (value, fault) = match place.root {
@@ -289,19 +289,19 @@ impl Subgroup {
                         (self.private[slot], fault)
                     }
                     Root::Shared(base) => {
-                        let (value, fault) = group.shared.load(base as usize + word, who);
+                        let (value, fault) = group.shared.load(base as usize + word, accessor);
                         (value, fault.map(Fault::from))
                     }
                     Root::Buffer(binding) => match buffer(d.buffers, binding, word) {
                         Some(memory) => {
-                            let (value, fault) = memory.load(word, who);
+                            let (value, fault) = memory.load(word, accessor);
                             (value, fault.map(Fault::from))
                         }
                         None => (GARBAGE, Some(Fault::Outside)),
                     },
                 };
                 if let Some(kind) = fault {
-                    d.faults.note(at, kind, || describe("load", place.root, word, who));
+                    d.faults.note(at, kind, || describe("load", place.root, word, accessor));
                 }
                 self.set(to + n as u32, lane, value);
             }
@@ -320,7 +320,7 @@ impl Subgroup {
         for k in 0..self.active.len() {
             let lane = self.active[k];
             let Some(first) = self.word(place, lane, at, d.faults) else { continue };
-            let who = self.who(lane, group, d, place.root);
+            let accessor = self.accessor(lane, group, d, place.root);
             for (&reg, &word) in from.iter().zip(words) {
                 let (word, value) = ((first + word) as usize, self.get(reg, lane));
                 let fault = match place.root {
@@ -330,16 +330,16 @@ impl Subgroup {
                         None
                     }
                     Root::Shared(base) => {
-                        group.shared.store(base as usize + word, value, who).map(Fault::from)
+                        group.shared.store(base as usize + word, value, accessor).map(Fault::from)
                     }
                     Root::Buffer(binding) => match buffer(d.buffers, binding, word) {
-                        Some(memory) => memory.store(word, value, who).map(Fault::from),
+                        Some(memory) => memory.store(word, value, accessor).map(Fault::from),
                         None => Some(Fault::Outside),
                     },
                     Root::Push | Root::Input(_) => Some(Fault::Outside),
                 };
                 if let Some(kind) = fault {
-                    d.faults.note(at, kind, || describe("store", place.root, word, who));
+                    d.faults.note(at, kind, || describe("store", place.root, word, accessor));
                 }
             }
         }
@@ -353,16 +353,16 @@ impl Subgroup {
                 self.set(*to, lane, GARBAGE);
                 continue;
             };
-            let (word, who) = (word as usize, self.who(lane, group, d, place.root));
+            let (word, accessor) = (word as usize, self.accessor(lane, group, d, place.root));
             let operands = (self.get(*value, lane), self.get(*expected, lane));
             let (before, fault) = match place.root {
                 Root::Shared(base) => {
-                    let (before, fault) = group.shared.atomic(*op, base as usize + word, operands, who);
+                    let (before, fault) = group.shared.atomic(*op, base as usize + word, operands, accessor);
                     (before, fault.map(Fault::from))
                 }
                 Root::Buffer(binding) => match buffer(d.buffers, binding, word) {
                     Some(memory) => {
-                        let (before, fault) = memory.atomic(*op, word, operands, who);
+                        let (before, fault) = memory.atomic(*op, word, operands, accessor);
                         (before, fault.map(Fault::from))
                     }
                     None => (GARBAGE, Some(Fault::Outside)),
@@ -370,7 +370,7 @@ impl Subgroup {
                 _ => (GARBAGE, Some(Fault::Outside)),
             };
             if let Some(kind) = fault {
-                d.faults.note(at, kind, || describe("atomic", place.root, word, who));
+                d.faults.note(at, kind, || describe("atomic", place.root, word, accessor));
             }
             self.set(*to, lane, before);
         }
@@ -395,11 +395,11 @@ impl Subgroup {
     }
 }
 
-/// The buffer of a binding if it reaches to a word.
+/// Buffer of a binding if it contains a word.
 fn buffer(buffers: &mut [Option<Memory>], binding: u32, word: usize) -> Option<&mut Memory> {
     buffers[binding as usize].as_mut().filter(|b| word < b.words.len())
 }
 
-fn describe(what: &str, root: Root, word: usize, who: Who) -> String {
-    format!("{what} of {root:?}, word {word}, by invocation {}", who.invocation - 1)
+fn describe(what: &str, root: Root, word: usize, accessor: Accessor) -> String {
+    format!("{what} of {root:?}, word {word}, by invocation {}", accessor.invocation - 1)
 }

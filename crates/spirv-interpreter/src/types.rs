@@ -1,4 +1,4 @@
-//! Types of a module: how many scalars a value has, and where they lie in memory.
+//! Types of a module: number of scalars of a value, and their layout in memory.
 use spirv::{Decoration, Op, StorageClass};
 use std::collections::HashMap;
 
@@ -25,8 +25,7 @@ pub struct Types {
     members: HashMap<(u32, u32), u32>,
 }
 
-/// Where an index leads: the type there, words from one element to the next, and how many there are
-/// if that is known.
+/// Element type of an index, the stride in words, and the number of elements if it is fixed.
 pub struct Member {
     pub ty: u32,
     pub stride: u32,
@@ -38,7 +37,7 @@ impl Types {
         self.all.get(&id).unwrap_or_else(|| panic!("%{id} is no type that shaders use"))
     }
 
-    /// `OpDecorate` and `OpMemberDecorate`, as far as they say where something lies.
+    /// Records the layout in `OpDecorate` and `OpMemberDecorate`.
     pub fn decorate(&mut self, op: Op, words: &[u32]) {
         match op {
             Op::Decorate if words[1] == Decoration::ArrayStride as u32 => {
@@ -54,7 +53,7 @@ impl Types {
         }
     }
 
-    /// Takes an `OpType…`; `constant` gives the values of array lengths.
+    /// Records an `OpType…`; `constant` returns the values of array lengths.
     pub fn declare(&mut self, op: Op, words: &[u32], constant: impl Fn(u32) -> u32) {
         let ty = match op {
             Op::TypeVoid | Op::TypeFunction => Type::Void,
@@ -91,7 +90,7 @@ impl Types {
         }
     }
 
-    /// Words from the first of a value in memory to behind its last.
+    /// Size of a value in memory, words.
     pub fn words(&self, id: u32) -> u32 {
         match self.get(id) {
             Type::RuntimeArray { .. } => 0,
@@ -116,28 +115,28 @@ impl Types {
         members[..member as usize].iter().map(|m| self.words(*m)).sum()
     }
 
-    /// The word of each scalar of a value in memory, in order.
-    pub fn places(&self, id: u32, first: u32, out: &mut Vec<u32>) {
+    /// Word offset of each scalar of a value in memory, in order.
+    pub fn word_offsets(&self, id: u32, first: u32, out: &mut Vec<u32>) {
         match self.get(id) {
             Type::Array { of, count } => {
-                (0..*count).for_each(|k| self.places(*of, first + k * self.stride(id, *of), out));
+                (0..*count).for_each(|k| self.word_offsets(*of, first + k * self.stride(id, *of), out));
             }
             Type::Struct { members } => {
                 for (k, member) in members.iter().enumerate() {
-                    self.places(*member, first + self.offset(id, k as u32), out);
+                    self.word_offsets(*member, first + self.offset(id, k as u32), out);
                 }
             }
             _ => out.extend((0..self.scalars(id) as u32).map(|k| first + k)),
         }
     }
 
-    /// Member `index` of a structure: its type and its first word.
+    /// Type and first word of member `index` of a structure.
     pub fn field(&self, id: u32, index: u32) -> Option<(u32, u32)> {
         let Type::Struct { members } = self.get(id) else { return None };
         Some((members[index as usize], self.offset(id, index)))
     }
 
-    /// What an index into anything but a structure leads to.
+    /// Element of an index into anything but a structure.
     pub fn element(&self, id: u32) -> Member {
         match self.get(id) {
             Type::Vector { of, count } => Member { ty: *of, stride: 1, count: Some(*count) },
@@ -152,7 +151,7 @@ impl Types {
         }
     }
 
-    /// Scalars before part `index` of a value, and the type of that part.
+    /// Number of scalars before part `index` of a value, and the type of that part.
     pub fn part(&self, id: u32, index: u32) -> (usize, u32) {
         match self.get(id) {
             Type::Struct { members } => {

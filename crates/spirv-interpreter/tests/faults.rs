@@ -26,7 +26,7 @@ fn run(spirv: &[u32], values: Memory, groups: u32, schedule: &Schedule) -> Resul
     Ok(buffers.remove(0).unwrap().words)
 }
 
-/// The faults of a shader on 64 zeros, in two workgroups.
+/// Faults of a shader on 64 zeros, in two workgroups.
 fn faults(body: &str) -> Vec<Fault> {
     match run(&compiled(body), Memory::of(vec![0; 64]), 2, &SCHEDULE) {
         Ok(_) => Vec::new(),
@@ -45,7 +45,7 @@ const SUM_OF_WORKGROUP: &str = "void main() {
 }";
 
 #[test]
-fn results_are_equal_at_any_subgroup_size_and_order() {
+fn results_are_independent_of_schedule() {
     let spirv = compiled(
         "void main() { uint v = values[gl_GlobalInvocationID.x]; values[gl_GlobalInvocationID.x] = 2u * v; }",
     );
@@ -63,7 +63,7 @@ fn results_are_equal_at_any_subgroup_size_and_order() {
 }
 
 #[test]
-fn a_removed_barrier_is_a_race() {
+fn removed_barrier_is_race() {
     let spirv = compiled(SUM_OF_WORKGROUP);
     let mut list = instructions(&spirv);
     list.retain(|i| i.op != spirv::Op::ControlBarrier);
@@ -85,14 +85,14 @@ fn faults_have_a_kind() {
 }
 
 #[test]
-fn words_that_start_unwritten_are_faults_to_read() {
+fn reading_unwritten_word_is_fault() {
     let spirv = compiled("void main() { values[gl_GlobalInvocationID.x] += 1u; }");
     let error = run(&spirv, Memory::empty(64), 2, &SCHEDULE).unwrap_err();
     assert!(error.to_string().contains("Unwritten"), "{error}");
 }
 
 #[test]
-fn a_wait_for_a_later_workgroup_is_stuck() {
+fn wait_for_later_workgroup_is_stuck() {
     let spirv = compiled(
         "void main() {
             if (gl_WorkGroupID.x == 0u && gl_LocalInvocationID.x == 0u) {

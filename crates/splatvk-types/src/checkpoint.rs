@@ -1,4 +1,4 @@
-//! The state of work under way on disk, so that it goes on where it was killed.
+//! State of unfinished work on disk, from which a killed process resumes.
 use crate::sync::lock;
 use crate::{Error, Result, files};
 use serde::Serialize;
@@ -8,22 +8,23 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// A place for one state, which the next replaces; reached through
+/// A file for one state, replaced at each save; reached through
 /// [`crate::progress::Progress::checkpoint`].
 pub struct Checkpoint {
     file: PathBuf,
     every: Duration,
     last: Mutex<Instant>,
     resume: bool,
-    /// The steps that the state on disk has behind it, as far as this process knows; [`UNKNOWN`]
-    /// otherwise.
+    /// Number of finished steps in the state on disk; [`UNKNOWN`] until this process has loaded or
+    /// saved one.
     done: AtomicU64,
 }
 
 const UNKNOWN: u64 = u64::MAX;
 
 impl Checkpoint {
-    /// A state in `file`, renewed after `every`; an old one is used only with `resume`.
+    /// A state in `file`, saved again after `every`; a state of an earlier process is used only
+    /// with `resume`.
     pub fn new(file: PathBuf, every: Duration, resume: bool) -> Checkpoint {
         Checkpoint { file, every, last: Mutex::new(Instant::now()), resume, done: AtomicU64::new(UNKNOWN) }
     }
@@ -34,8 +35,7 @@ impl Checkpoint {
         postcard::from_bytes(&bytes).ok()
     }
 
-    /// What the state on disk, of this process or an earlier one, is a state of; `None` where there
-    /// is none.
+    /// Description of the state on disk, of this process or an earlier one; `None` without a file.
     pub fn named(&self, stage: &str) -> Option<String> {
         self.file.is_file().then(|| match self.done.load(Ordering::Relaxed) {
             UNKNOWN => format!("the state of stage {stage}"),
@@ -43,18 +43,18 @@ impl Checkpoint {
         })
     }
 
-    /// The state that was loaded has so many steps behind it.
+    /// Records the number of finished steps of the state that was loaded.
     pub fn went_on_from(&self, done: usize) {
         self.done.store(done as u64, Ordering::Relaxed);
     }
 
-    /// Whether it is time for the next.
+    /// Whether the next save is due.
     pub fn due(&self) -> bool {
         lock(&self.last).elapsed() >= self.every
     }
 
-    /// Writes the state after `done` steps. A disk that is full costs the next process time, not
-    /// this one its result.
+    /// Writes the state after `done` steps. A full disk is no error: the result of this process
+    /// does not depend on the file.
     pub fn save<T: Serialize>(&self, done: usize, state: &T) -> Result<()> {
         let bytes = postcard::to_stdvec(state).map_err(|e| Error::work(format!("checkpoint: {e}")))?;
         if files::write_with_checksum(&self.file, &bytes).is_ok() {
@@ -64,7 +64,7 @@ impl Checkpoint {
         Ok(())
     }
 
-    /// The work is done.
+    /// Removes the state once the work is done.
     pub fn remove(&self) {
         // Most work ends before its first checkpoint.
         let _ = std::fs::remove_file(&self.file);

@@ -1,5 +1,4 @@
-//! The one error type. Every message is a single line that says what is wrong, where, and what to
-//! do next.
+//! The one error type. Every message is a single line: what is wrong, where, and what to do next.
 mod system;
 
 pub use system::words;
@@ -7,24 +6,25 @@ pub use system::words;
 use std::path::{Path, PathBuf};
 use system::advice;
 
-/// The crate's result.
+/// Result with the crate's error.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// The cause of an error.
+/// Underlying cause of an error.
 pub type Cause = Box<dyn std::error::Error + Send + Sync + 'static>;
 
-/// Everything that can go wrong, by what a program may do about it. The message alone says
-/// everything; [`source`] is there for what the system or the driver said. [`Error::exit_code`]
-/// maps it to the process exit code.
+/// Errors by how a program may react to them. The message is complete without the cause; [`source`]
+/// returns the error of the system or the driver. [`Error::exit_code`] maps an error to the process
+/// exit code.
 ///
 /// [`source`]: std::error::Error::source
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// What the user typed or supplied cannot be used: the message names it and says what to do.
+    /// Unusable argument or file of the user: the message names it and states what to do.
     #[error("{0}")]
     Input(String),
-    /// A file could not be read, or not written for a reason that only its cause can tell.
+    /// A file could not be read, or could not be written for a reason that only the cause
+    /// determines.
     #[error("{}: {}{}", path.display(), words(source), advice(source))]
     Io {
         /// The file or folder.
@@ -32,24 +32,24 @@ pub enum Error {
         /// The error of the operating system.
         source: std::io::Error,
     },
-    /// A place cannot take a file: the disk is full, or the folder or file system does not allow
-    /// it. Nothing half-written stays there; the same work succeeds once there is space, or in
-    /// another place.
+    /// A file cannot be written at a place: the disk is full, or the folder or file system does not
+    /// allow it. Nothing half-written stays there; the same work succeeds once there is space, or
+    /// elsewhere.
     #[error("{}: cannot be written: {}{}", path.display(), words(source), elsewhere(source))]
     Unwritable {
         /// The file or folder.
         path: PathBuf,
-        /// What the operating system said; its [`kind`](std::io::Error::kind) tells a full disk
+        /// Error of the operating system; its [`kind`](std::io::Error::kind) separates a full disk
         /// from a missing permission.
         source: std::io::Error,
     },
     /// The inference library, a program or another installable part is missing or cannot be used.
     #[error("{0}")]
     Missing(String),
-    /// A model, or a file of it, is missing, corrupt or not what it is used for.
+    /// A model, or one of its files, is missing, corrupt or of the wrong type.
     #[error("{message}")]
     MissingModel {
-        /// Its name in the model table, that of its folder, or the path of the file.
+        /// Name in the model table, name of its folder, or path of the file.
         model: String,
         /// The fault and how to get the model.
         message: String,
@@ -62,14 +62,14 @@ pub enum Error {
         /// The error of the loader or the driver, if there is one.
         source: Option<Cause>,
     },
-    /// The Vulkan device was lost: reset by its driver, removed, or asleep. Everything on it is
-    /// gone and nothing more can be done with it; a new [`crate::gpu::Device`] may work.
+    /// The Vulkan device was lost: reset by its driver, removed, or asleep. Its contents are gone
+    /// and no further call succeeds; a new [`crate::gpu::Device`] may work.
     #[error("Vulkan: {doing}: the device was lost ({source}); {}", after_loss(kept))]
     DeviceLost {
         /// The operation that failed.
         doing: String,
-        /// The last thing that is on disk, from which the same run with `resume` goes on: "stage
-        /// splats after step 120".
+        /// Last state on disk, from which the same run continues with `resume`: "stage splats after
+        /// step 120".
         kept: Option<String>,
         /// The driver's error.
         source: Cause,
@@ -82,17 +82,17 @@ pub enum Error {
     OutOfDeviceMemory {
         /// The operation that failed, with its size where one is known.
         doing: String,
-        /// As that of [`Error::DeviceLost`].
+        /// As in [`Error::DeviceLost`].
         kept: Option<String>,
         /// The driver's error.
         source: Cause,
     },
-    /// The Vulkan driver refused something else, or the device cannot do it.
+    /// The Vulkan driver refused another operation, or the device does not support it.
     #[error("Vulkan: {message}")]
     Gpu {
         /// The refused operation and the reason.
         message: String,
-        /// The driver's error, if it was asked.
+        /// Error of the driver, if the driver was called.
         source: Option<Cause>,
     },
     /// Something failed while working on valid input.
@@ -128,8 +128,8 @@ impl Error {
     pub fn gpu(message: impl Into<String>) -> Self {
         Error::Gpu { message: message.into(), source: None }
     }
-    /// Attaches the path to an I/O error: `.map_err(Error::io(path))`. What only writing can meet
-    /// becomes [`Error::Unwritable`].
+    /// Attaches the path to an I/O error: `.map_err(Error::io(path))`. Kinds that occur only in
+    /// writing become [`Error::Unwritable`].
     pub fn io(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Error {
         use std::io::ErrorKind as K;
         let path = path.as_ref().to_path_buf();
@@ -140,12 +140,12 @@ impl Error {
             _ => Error::Io { path, source },
         }
     }
-    /// Attaches the path to an I/O error of writing, whatever it was.
+    /// Attaches the path to an I/O error of writing, of any kind.
     pub fn unwritable(path: impl AsRef<Path>) -> impl FnOnce(std::io::Error) -> Error {
         let path = path.as_ref().to_path_buf();
         move |source| Error::Unwritable { path, source }
     }
-    /// Adds the last state on disk, unless a later one is named already.
+    /// Adds the last state on disk, unless one is set already.
     pub fn keeping(mut self, last: Option<String>) -> Self {
         if let Error::DeviceLost { kept, .. } | Error::OutOfDeviceMemory { kept, .. } = &mut self
             && kept.is_none()
@@ -154,8 +154,8 @@ impl Error {
         }
         self
     }
-    /// 2 for bad usage, bad input, a missing part or a place that cannot be written (also a full
-    /// disk); 1 for a failure while working; 130 when stopped by the user.
+    /// Process exit code: 2 for bad usage, bad input, a missing part or a place that cannot be
+    /// written (also a full disk); 1 for a failure while working; 130 when stopped by the user.
     pub fn exit_code(&self) -> u8 {
         match self {
             Error::Input(_) | Error::Missing(_) | Error::MissingModel { .. } => 2,
@@ -194,13 +194,13 @@ impl From<splatvk_gpu::Error> for Error {
 fn elsewhere(e: &std::io::Error) -> &'static str {
     use std::io::ErrorKind as K;
     match (e.kind(), advice(e)) {
-        // It was to be made.
+        // The path does not exist yet: it was about to be created.
         (K::NotFound | K::NotADirectory | K::IsADirectory, _) | (_, "") => "; choose another folder",
         (_, advice) => advice,
     }
 }
 
-/// How to go on without the device.
+/// Advice after a lost device.
 fn after_loss(kept: &Option<String>) -> String {
     match kept {
         Some(last) => format!("the same command with --resume goes on from {last}"),
@@ -210,7 +210,7 @@ fn after_loss(kept: &Option<String>) -> String {
     }
 }
 
-/// How to go on once other programs have freed the device's memory.
+/// Advice after device memory ran out, where a state is on disk.
 fn once_there_is_memory(kept: &Option<String>) -> String {
     let resume = |last| format!("; once there is memory, the same command with --resume goes on from {last}");
     kept.as_ref().map(resume).unwrap_or_default()
@@ -223,7 +223,7 @@ mod tests {
     use std::io::{Error as IoError, ErrorKind};
 
     #[test]
-    fn a_program_can_tell_what_to_react_to_and_see_the_cause() {
+    fn error_keeps_cause_and_exit_code() {
         let lost = Error::DeviceLost { doing: "step 7".into(), kept: None, source: "lost".into() };
         assert!(lost.source().is_some_and(|s| s.to_string() == "lost"));
         assert!(!lost.to_string().contains("--resume"), "{lost}");
@@ -247,7 +247,7 @@ mod tests {
         assert!(disk.exit_code() == 2 && disk.to_string().contains("free some space"), "{disk}");
         let absent = Error::io("a/b")(IoError::from(ErrorKind::NotFound));
         assert!(matches!(absent, Error::Io { .. }) && absent.exit_code() == 2);
-        // A file in the place of a folder, and the other way round, are the user's to mend.
+        // A file in the place of a folder, and the reverse, are errors of the user.
         for kind in [ErrorKind::NotADirectory, ErrorKind::IsADirectory] {
             let e = Error::io("a/b")(IoError::from(kind));
             assert!(e.exit_code() == 2 && e.to_string().ends_with("; check the name"), "{e}");
@@ -259,15 +259,16 @@ mod tests {
 
     #[cfg(feature = "gpu")]
     #[test]
-    fn errors_of_the_gpu_keep_their_kind_and_cause() {
+    fn gpu_error_keeps_kind_and_cause() {
         use splatvk_gpu::VulkanError;
-        let of = |code| Error::from(splatvk_gpu::Error::vulkan("step 7", VulkanError::from_code(code)));
-        let lost = of(-4);
+        let converted =
+            |code| Error::from(splatvk_gpu::Error::vulkan("step 7", VulkanError::from_code(code)));
+        let lost = converted(-4);
         assert!(matches!(&lost, Error::DeviceLost { doing, kept: None, .. } if doing == "step 7"));
         let cause = lost.source().and_then(|s| s.downcast_ref::<VulkanError>());
         assert_eq!(cause, Some(&VulkanError::from_code(-4)));
-        assert!(matches!(of(-2), Error::OutOfDeviceMemory { .. }));
-        assert!(matches!(of(-3), Error::Gpu { source: Some(_), .. }));
+        assert!(matches!(converted(-2), Error::OutOfDeviceMemory { .. }));
+        assert!(matches!(converted(-3), Error::Gpu { source: Some(_), .. }));
         let unknown = Error::from(splatvk_gpu::Error::Choice("no such device".into()));
         assert_eq!(unknown.exit_code(), 2);
     }

@@ -1,5 +1,5 @@
-//! Files read within bounds; files that are whole or not there: written beside their place and
-//! renamed into it, some with a checksum in front; and the rule for what may be written over.
+//! Bounded reading of files, atomic writing (beside the place, then renamed), some with a checksum
+//! in front, and the rule for overwriting.
 mod guard;
 mod hash;
 mod home;
@@ -34,7 +34,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, OnceLock};
 use std::time::SystemTime;
 
-/// Beyond the bytes of a file a reader takes at most four times its content, and this much
+/// Memory that a reader may take beyond four times the bytes of its file, bytes
 /// (docs/use/formats.md#limits).
 pub const ROOM: u64 = 64 << 20;
 
@@ -46,8 +46,7 @@ const LONGEST_TEXT: u64 = 64 << 20;
 /// 450,000.
 const MOST_VALUES: usize = 1 << 20;
 
-/// How many times its bytes the content of a compressed file may have: Gaussians and features reach
-/// 5.
+/// Largest ratio of content to file size of a compressed file: Gaussians and features reach 5.
 const EXPANSION: u64 = 16;
 
 /// Most bytes that a compressed file of `size` bytes may hold.
@@ -55,33 +54,39 @@ pub fn most_content(size: usize) -> u64 {
     (size as u64).saturating_mul(EXPANSION).saturating_add(ROOM)
 }
 
-/// Opens a file that is to be read, and its size in bytes. Devices, pipes and folders are refused:
-/// they have no end, or none that can be known.
+/// Opens a file for reading; returns it with its size in bytes. Devices, pipes and folders are
+/// refused: their size is unknown or unbounded.
 pub fn open(path: &Path) -> Result<(File, u64)> {
-    let unreadable = |e: std::io::Error| match e.kind() {
+    // Checked before opening, too: opening a pipe blocks until a writer opens it.
+    regular_size(&std::fs::metadata(path).map_err(unreadable(path))?, path)?;
+    let file = File::open(path).map_err(unreadable(path))?;
+    let size = regular_size(&file.metadata().map_err(Error::io(path))?, path)?;
+    Ok((file, size))
+}
+
+/// Error for a file that cannot be opened.
+fn unreadable(path: &Path) -> impl Fn(std::io::Error) -> Error {
+    move |e| match e.kind() {
         std::io::ErrorKind::NotFound => Error::io(path)(e),
         _ => Error::input(format!(
             "{}: {}; check the name and that you may read it",
             path.display(),
             words(&e)
         )),
-    };
-    let regular = |meta: &std::fs::Metadata| match meta.is_file() {
-        true => Ok(meta.len()),
-        false => {
-            let kind = if meta.is_dir() { "a folder" } else { "a device or pipe" };
-            Err(Error::input(format!("{}: is {kind}, not a file; give a file", path.display())))
-        }
-    };
-    // Asked before it is opened, too: opening a pipe waits for somebody to write to it.
-    regular(&std::fs::metadata(path).map_err(unreadable)?)?;
-    let file = File::open(path).map_err(unreadable)?;
-    let size = regular(&file.metadata().map_err(Error::io(path))?)?;
-    Ok((file, size))
+    }
 }
 
-/// Reads a whole file: as many bytes as it has when it is opened. Everything that is read whole is
-/// read here.
+/// Size of a regular file in bytes; refuses everything else.
+fn regular_size(meta: &std::fs::Metadata, path: &Path) -> Result<u64> {
+    if meta.is_file() {
+        return Ok(meta.len());
+    }
+    let kind = if meta.is_dir() { "a folder" } else { "a device or pipe" };
+    Err(Error::input(format!("{}: is {kind}, not a file; give a file", path.display())))
+}
+
+/// Reads a whole file: as many bytes as it has when it is opened. All whole-file reads go through
+/// here.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
     read_within(path, u64::MAX)
 }
@@ -101,7 +106,7 @@ fn read_open(file: File, size: u64, path: &Path) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let room = usize::try_from(size).ok().and_then(|n| bytes.try_reserve_exact(n.checked_add(1)?).ok());
     room.ok_or_else(|| Error::work(format!("{}: no memory for its {size} bytes", path.display())))?;
-    // One more than announced: files of the system announce none and go on for ever.
+    // One byte more than announced: files of /proc announce none, and some have no end.
     file.take(size.saturating_add(1)).read_to_end(&mut bytes).map_err(Error::io(path))?;
     if bytes.len() as u64 != size {
         return Err(Error::input(format!(
@@ -119,9 +124,9 @@ pub fn read_text(path: &Path) -> Result<String> {
     Ok(text.to_owned())
 }
 
-/// The text of a file's bytes, without the byte-order mark that editors of Windows put in front.
+/// Text of a file's bytes, without the byte-order mark that editors of Windows put in front.
 pub fn plain_text(bytes: &[u8]) -> Result<&str, String> {
-    // JSON, TOML and tables of numbers begin with ASCII, whose other byte is zero in UTF-16.
+    // JSON, TOML and tables of numbers begin with ASCII; in UTF-16 its other byte is zero.
     let ascii = |byte: u8| byte.is_ascii_graphic() || byte.is_ascii_whitespace();
     let utf16 = match bytes {
         [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => true,
@@ -135,13 +140,13 @@ pub fn plain_text(bytes: &[u8]) -> Result<&str, String> {
     std::str::from_utf8(bytes).map_err(|_| "is not text (UTF-8); check that it is the right file".to_owned())
 }
 
-/// Reads a JSON file; `advice` says what to do where it is not what is looked for.
+/// Reads a JSON file; `advice` ends the message where it cannot be parsed.
 pub fn read_json<T: serde::de::DeserializeOwned>(path: &Path, advice: &str) -> Result<T> {
     let bytes = read_within(path, LONGEST_TEXT)?;
     parse_json(&bytes).map_err(|e| Error::input(format!("{}: {e}; {advice}", path.display())))
 }
 
-/// Parses JSON of a bounded number of values.
+/// Parses JSON with a bounded number of values.
 pub fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, String> {
     let text = plain_text(bytes)?;
     let bytes = text.as_bytes();
@@ -161,10 +166,10 @@ pub fn parse_json<'a, T: Deserialize<'a>>(bytes: &'a [u8]) -> Result<T, String> 
     serde_json::from_str(text).map_err(|e| e.to_string())
 }
 
-/// Hexadecimal digits of the checksum.
+/// Number of hexadecimal digits of the checksum.
 const CHECKSUM_DIGITS: usize = 64;
 
-/// sha256 of a file in lower-case hex; remembered per path, size and modification time.
+/// sha256 of a file in lower-case hex; cached per path, size and modification time.
 pub fn content_hash(path: &Path) -> std::io::Result<String> {
     type HashCache = HashMap<PathBuf, (u64, SystemTime, String)>;
     static CACHE: OnceLock<Mutex<HashCache>> = OnceLock::new();
@@ -192,11 +197,10 @@ pub fn content_hash(path: &Path) -> std::io::Result<String> {
     Ok(hash)
 }
 
-/// Writes `parts` one after the other to a file of the program's own that appears whole or not at
-/// all, and that only its user can read; makes its folder, and removes what killed processes have
-/// left there.
+/// Writes `parts` one after the other to a private file of the program, atomically, readable by its
+/// user only; creates its folder, and removes leftovers of killed processes there.
 pub fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
-    // One at a time: of two threads that keep the same thing the second would be refused.
+    // One thread at a time: of two that write the same file the second would be refused.
     static WRITING: Mutex<()> = Mutex::new(());
     let _turn = lock(&WRITING);
     let folder = path.parent().unwrap_or(path);
@@ -209,8 +213,8 @@ pub fn write(path: &Path, parts: &[&[u8]]) -> std::io::Result<()> {
     partial.keep(|from| std::fs::rename(from, path))
 }
 
-/// Makes a folder that only its user can look into, with the folders that it is in; one that is
-/// there stays as it is.
+/// Creates a folder with its parents, accessible by its user only; an existing folder keeps its
+/// mode.
 fn private_folder(folder: &Path) -> std::io::Result<()> {
     let mut builder = std::fs::DirBuilder::new();
     #[cfg(unix)]
@@ -218,7 +222,7 @@ fn private_folder(folder: &Path) -> std::io::Result<()> {
     builder.recursive(true).create(folder)
 }
 
-/// Makes a file that only its user can read and write.
+/// Creates a file that only its user can read and write.
 fn private_file(path: &Path) -> std::io::Result<File> {
     let mut options = File::options();
     #[cfg(unix)]
@@ -226,21 +230,21 @@ fn private_file(path: &Path) -> std::io::Result<File> {
     options.write(true).create_new(true).open(path)
 }
 
-/// Whether nobody but the user can have written a file: it is the user's own or that of the
-/// system's owner, and no group or other users may write to it.
+/// Whether only the user or root can have written a file: one of them owns it, and group and others
+/// may not write to it.
 #[cfg(unix)]
 fn is_own(meta: &std::fs::Metadata) -> bool {
     use std::os::unix::fs::MetadataExt;
     meta.mode() & 0o022 == 0 && user().is_none_or(|user| [0, user].contains(&meta.uid()))
 }
 
-/// Files have no such modes.
+/// Files of other systems have no such modes.
 #[cfg(not(unix))]
 fn is_own(_: &std::fs::Metadata) -> bool {
     true
 }
 
-/// The user as whom the process works; `None` where the system is not asked.
+/// Effective user id of the process; `None` on systems where it is not read.
 #[cfg(unix)]
 fn user() -> Option<u32> {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
@@ -255,7 +259,7 @@ pub fn write_with_checksum(path: &Path, body: &[u8]) -> std::io::Result<()> {
     write(path, &[sha256(body).as_bytes(), body])
 }
 
-/// What [`write_with_checksum`] wrote; `None` if it is not there, not what was written, or another
+/// Body of a file of [`write_with_checksum`]; `None` if it is missing or damaged, or if another
 /// user may have written it. Counts as a use for [`prune`].
 pub fn read_with_checksum(path: &Path) -> Option<Vec<u8>> {
     let (file, size) = open(path).ok()?;
@@ -267,7 +271,7 @@ pub fn read_with_checksum(path: &Path) -> Option<Vec<u8>> {
     if *sum != *sha256(body).as_bytes() {
         return None;
     }
-    // A folder that cannot be written to prunes nothing either.
+    // In a read-only folder nothing is pruned either.
     let _ = std::fs::File::options().append(true).open(path).and_then(|f| f.set_modified(SystemTime::now()));
     bytes.drain(..CHECKSUM_DIGITS);
     Some(bytes)
@@ -283,17 +287,13 @@ pub fn in_folder(folder: &Path, extension: &str) -> Vec<(PathBuf, u64)> {
     all
 }
 
-/// Removes the files of a folder with this extension that were not used for longest, until the rest
-/// fits into `capacity` bytes; never `newest`.
+/// Removes the least recently used files of a folder with this extension until the rest fits into
+/// `capacity` bytes; never removes `newest`.
 pub fn prune(newest: &Path, extension: &str, capacity: u64) {
     let Some(folder) = newest.parent() else { return };
-    let entry = |e: std::fs::DirEntry| {
-        let meta = e.metadata().ok()?;
-        Some((meta.modified().ok()?, meta.len(), e.path()))
-    };
     let list = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let mut files: Vec<_> =
-        list.filter_map(entry).filter(|f| f.2.extension().is_some_and(|e| e == extension)).collect();
+        list.filter_map(age_and_size).filter(|f| f.2.extension().is_some_and(|e| e == extension)).collect();
     files.sort();
     let mut total: u64 = files.iter().map(|f| f.1).sum();
     for (_, size, path) in files {
@@ -306,51 +306,59 @@ pub fn prune(newest: &Path, extension: &str, capacity: u64) {
     }
 }
 
+/// Modification time, size in bytes and path of an entry.
+fn age_and_size(entry: std::fs::DirEntry) -> Option<(SystemTime, u64, PathBuf)> {
+    let meta = entry.metadata().ok()?;
+    Some((meta.modified().ok()?, meta.len(), entry.path()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    /// `[1]` in UTF-16, with or without a byte-order mark.
+    fn utf16(order: fn(u16) -> [u8; 2], mark: bool) -> Vec<u8> {
+        let marks = if mark { "\u{feff}" } else { "" };
+        format!("{marks}[1]").encode_utf16().flat_map(order).collect()
+    }
+
     #[test]
-    fn only_regular_files_of_a_bounded_length_are_read() {
+    fn read_refuses_irregular_or_long_files() {
         let folder = tempfile::tempdir().unwrap();
-        let at = |name: &str| folder.path().join(name);
+        let path_of = |name: &str| folder.path().join(name);
         let refused = |path: &Path, words: &str| {
             let e = read(path).unwrap_err();
             assert!(e.exit_code() == 2 && e.to_string().contains(words), "{e}");
         };
-        std::fs::write(at("a"), b"abc").unwrap();
-        assert_eq!(read(&at("a")).unwrap(), b"abc");
-        std::fs::write(at("none"), b"").unwrap();
-        assert_eq!(read(&at("none")).unwrap(), b"");
+        std::fs::write(path_of("a"), b"abc").unwrap();
+        assert_eq!(read(&path_of("a")).unwrap(), b"abc");
+        std::fs::write(path_of("none"), b"").unwrap();
+        assert_eq!(read(&path_of("none")).unwrap(), b"");
         refused(folder.path(), "is a folder");
-        refused(&at("b"), "check the name");
-        let e = read_within(&at("a"), 2).unwrap_err();
+        refused(&path_of("b"), "check the name");
+        let e = read_within(&path_of("a"), 2).unwrap_err();
         assert!(e.to_string().contains("3 bytes are too many"), "{e}");
-        std::fs::write(at("binary"), b"\xff\xd8").unwrap();
-        assert!(read_text(&at("binary")).unwrap_err().to_string().contains("not text"));
+        std::fs::write(path_of("binary"), b"\xff\xd8").unwrap();
+        assert!(read_text(&path_of("binary")).unwrap_err().to_string().contains("not text"));
         #[cfg(target_os = "linux")]
         {
             use std::os::unix::fs::symlink;
-            symlink("/dev/zero", at("zero")).unwrap();
-            refused(&at("zero"), "is a device or pipe");
-            symlink(at("loop"), at("loop")).unwrap();
-            refused(&at("loop"), "check the name and that you may read it");
-            // Announces no bytes and has some.
+            symlink("/dev/zero", path_of("zero")).unwrap();
+            refused(&path_of("zero"), "is a device or pipe");
+            symlink(path_of("loop"), path_of("loop")).unwrap();
+            refused(&path_of("loop"), "check the name and that you may read it");
+            // Announces no bytes but has some.
             refused(Path::new("/proc/self/status"), "another length");
         }
     }
 
     #[test]
-    fn text_is_read_as_editors_write_it() {
+    fn text_strips_bom_refuses_utf16() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("a.json");
         std::fs::write(&file, b"\xef\xbb\xbf[1, 2]\r\n").unwrap();
         assert_eq!(read_text(&file).unwrap(), "[1, 2]\r\n");
         assert_eq!(read_json::<Vec<u8>>(&file, "").unwrap(), [1, 2]);
-        let utf16 = |order: fn(u16) -> [u8; 2], mark: bool| -> Vec<u8> {
-            let marks = if mark { "\u{feff}" } else { "" };
-            format!("{marks}[1]").encode_utf16().flat_map(order).collect()
-        };
         for bytes in [
             utf16(u16::to_le_bytes, true),
             utf16(u16::to_be_bytes, true),
@@ -365,7 +373,7 @@ mod tests {
     }
 
     #[test]
-    fn json_of_many_values_is_refused_before_it_is_parsed() {
+    fn json_beyond_value_limit_is_refused() {
         let many = format!("[0{}]", ",0".repeat(MOST_VALUES));
         assert!(parse_json::<serde_json::Value>(many.as_bytes()).unwrap_err().contains("values"));
         let text = format!("[\"{}\\\"{}\"]", ",".repeat(MOST_VALUES), "[".repeat(MOST_VALUES));
@@ -373,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_damaged_or_half_written_is_not_there() {
+    fn damaged_checksum_file_reads_as_none() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("deep/a.kept");
         assert_eq!(read_with_checksum(&file), None);
@@ -401,14 +409,14 @@ mod tests {
             assert_eq!(read_with_checksum(&file).is_some(), own, "{mode:o}");
         }
         std::fs::set_permissions(&file, std::fs::Permissions::from_mode(0o600)).unwrap();
-        // Only the system's owner can give a file away.
+        // Only root can give a file away.
         if std::os::unix::fs::chown(&file, Some(65534), None).is_ok() {
             assert_eq!(read_with_checksum(&file), None, "of another user");
         }
     }
 
     #[test]
-    fn what_a_killed_process_left_goes_with_the_next_file_and_threads_do_not_share_one() {
+    fn write_sweeps_leftovers_and_serialises_threads() {
         let folder = tempfile::tempdir().unwrap();
         leave(&folder.path().join(".rgb-1.stage.partial-splatvk")).unwrap();
         let file = folder.path().join("a.kept");
@@ -425,19 +433,19 @@ mod tests {
     }
 
     #[test]
-    fn the_least_recently_used_go_first_and_other_files_stay() {
+    fn prune_removes_least_recently_used() {
         let folder = tempfile::tempdir().unwrap();
-        let at = |name: &str| folder.path().join(name);
+        let path_of = |name: &str| folder.path().join(name);
         for (age, name) in ["old.kept", "used.kept", "new.kept", "other.txt"].iter().enumerate() {
-            std::fs::write(at(name), [0; 100]).unwrap();
+            std::fs::write(path_of(name), [0; 100]).unwrap();
             let time = SystemTime::UNIX_EPOCH + std::time::Duration::from_secs(age as u64);
-            std::fs::File::options().append(true).open(at(name)).unwrap().set_modified(time).unwrap();
+            std::fs::File::options().append(true).open(path_of(name)).unwrap().set_modified(time).unwrap();
         }
-        prune(&at("new.kept"), "kept", 250);
+        prune(&path_of("new.kept"), "kept", 250);
         let there: Vec<bool> =
-            ["old.kept", "used.kept", "new.kept", "other.txt"].iter().map(|n| at(n).exists()).collect();
+            ["old.kept", "used.kept", "new.kept", "other.txt"].iter().map(|n| path_of(n).exists()).collect();
         assert_eq!(there, [false, true, true, true]);
-        prune(&at("new.kept"), "kept", 0);
-        assert!(!at("used.kept").exists() && at("new.kept").exists());
+        prune(&path_of("new.kept"), "kept", 0);
+        assert!(!path_of("used.kept").exists() && path_of("new.kept").exists());
     }
 }

@@ -4,8 +4,8 @@
 //!   conventions of axes and units.
 //! - [`math`]: one random generator, statistics, dot products.
 //! - [`Error`] and [`Result`]: errors by what a program may do about them.
-//! - [`progress`] and [`checkpoint`]: how long work reports, stops and goes on.
-//! - [`files`]: files read within bounds and written as a whole; owners of unfinished work.
+//! - [`progress`] and [`checkpoint`]: progress, cancellation and resumption of long work.
+//! - [`files`]: bounded reading, atomic writing; owners of unfinished work.
 //!
 //! ```
 //! use splatvk_types::scene::{Camera, Pose};
@@ -23,7 +23,7 @@
 //! let point = camera.unproject(glam::DVec2::new(32.0, 24.0), 4.0);
 //! assert_eq!(point, glam::DVec3::new(0.0, 0.0, 4.0));
 //! ```
-// [N, 3] in the docs states a shape; rustdoc takes it for a link.
+// Docs state shapes as [N, 3], which rustdoc reads as links.
 #![allow(rustdoc::broken_intra_doc_links)]
 
 pub mod checkpoint;

@@ -1,6 +1,6 @@
-//! Time against quality, for every stage that can trade them.
+//! Trade-off of time and quality, for every stage that has one.
 
-/// How much time a run may take.
+/// Length of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub enum Preset {
     /// A few hundred steps: minutes on a CPU device.

@@ -1,4 +1,4 @@
-//! Test support: the breakfast views with what is known exactly about them.
+//! Views of the breakfast set with their ground truth.
 use std::path::PathBuf;
 
 use glam::{DMat3, DVec3};
@@ -14,7 +14,7 @@ pub struct TestView {
     pub camera: Camera,
 }
 
-/// The folder of the set.
+/// Folder of the set.
 pub fn folder() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/breakfast")
 }
@@ -37,7 +37,7 @@ pub fn train_views() -> Vec<TestView> {
     views("train")
 }
 
-/// The views of a split: "train" or "test".
+/// Views of a split: "train" or "test".
 pub fn views(split: &str) -> Vec<TestView> {
     let truth = ground_truth();
     let frames = truth["frames"].as_array().unwrap();

@@ -1,10 +1,10 @@
-//! Test support: tiny ONNX files, built byte by byte (field numbers of the published onnx.proto3).
+//! Tiny ONNX files, built byte by byte (field numbers of the published onnx.proto3).
 use std::path::Path;
 
 pub const FLOAT: u64 = 1;
 pub const INT64: u64 = 7;
 
-/// A graph under construction. Axes are numbers or names ("?" stands for any).
+/// A graph under construction. Axes are numbers or names ("?" = any).
 #[derive(Default)]
 pub struct Onnx {
     pub opset: u64,
@@ -40,7 +40,7 @@ fn port(name: &str, kind: u64, dims: &str) -> Vec<u8> {
         Err(_) => bytes(1, &bytes(2, d.as_bytes())),
     };
     let mut tensor = number(1, kind);
-    // "…": the file does not tell.
+    // "…": no shape in the file.
     if dims != "…" {
         tensor.extend(bytes(2, &dims.split_whitespace().flat_map(axis).collect::<Vec<u8>>()));
     }
@@ -80,7 +80,7 @@ impl Onnx {
         self
     }
 
-    /// A weight whose values are in another file.
+    /// A weight with its values in another file.
     pub fn external(mut self, name: &str, dims: &[u64], file: &str) -> Onnx {
         let mut t: Vec<u8> = dims.iter().flat_map(|d| number(1, *d)).collect();
         t.extend(number(2, FLOAT));
@@ -91,7 +91,7 @@ impl Onnx {
         self
     }
 
-    /// `op inputs → outputs`.
+    /// Appends the node `op inputs → outputs`.
     pub fn node(mut self, op: &str, inputs: &str, outputs: &str, attributes: &[(&str, Attribute)]) -> Onnx {
         let mut n: Vec<u8> = inputs.split_whitespace().flat_map(|i| bytes(1, i.as_bytes())).collect();
         n.extend(outputs.split_whitespace().flat_map(|o| bytes(2, o.as_bytes())));

@@ -12,8 +12,8 @@ pub struct Set {
     pub sparse: Vec<DVec3>,
 }
 
-/// Smooth noise over the plane, three octaves down to about four pixels: something to match
-/// everywhere.
+/// Smooth noise over the plane, three octaves down to about four pixels, so that every region can
+/// be matched.
 fn texture(u: f64, v: f64) -> f32 {
     let lattice = |x: i64, y: i64, octave: u32| {
         let h = hash(x as u32 ^ hash(y as u32 ^ hash(octave)));
@@ -37,7 +37,7 @@ pub fn synthetic(width: u32, height: u32) -> Set {
     synthetic_from(width, height, 0.8)
 }
 
-/// The same with the outer cameras `reach` away from the middle one.
+/// Like [`synthetic`], with the outer cameras `reach` away from the middle one.
 pub fn synthetic_from(width: u32, height: u32, reach: f64) -> Set {
     let f = 1.1 * width as f64;
     let cameras: Vec<Camera> = [-reach, 0.0, reach]
@@ -51,7 +51,7 @@ pub fn synthetic_from(width: u32, height: u32, reach: f64) -> Set {
             fy: f,
             cx: width as f64 / 2.0,
             cy: height as f64 / 2.0,
-            // Turned about the vertical axis to keep looking at the point 4 units ahead.
+            // Rotated about the vertical axis towards the point 4 units ahead.
             pose: Pose {
                 rotation: DMat3::from_rotation_y((x / 4.0f64).atan()),
                 translation: -(DMat3::from_rotation_y((x / 4.0f64).atan()) * DVec3::new(x, 0.1 * x, 0.0)),
@@ -76,7 +76,7 @@ pub fn synthetic_from(width: u32, height: u32, reach: f64) -> Set {
             // Base period of 16 pixels at a depth of 4 for 160-pixel photos.
             let period = 16.0 * 4.0 / (1.1 * 160.0);
             let shade = texture(p.x / period + 100.0 * on_square as u8 as f64, p.y / period);
-            // Two tints, so that filling has an edge to find.
+            // Two tints, so that filling meets an edge.
             let tint = if on_square { [1.0, 0.6, 0.5] } else { [0.6, 0.8, 1.0] };
             image.data.push(tint.map(|t: f32| (t * (0.2 + 0.8 * shade) * 255.0).round() / 255.0));
             depth.data[k] = z as f32;
@@ -109,8 +109,8 @@ pub fn within(errors: &[f32], limit: f32) -> f32 {
     errors.iter().filter(|&&e| e < limit).count() as f32 / errors.len() as f32
 }
 
-/// The training views of breakfast shrunk by `shrink`, with exact cameras and 60 exact points per
-/// view.
+/// Training views of breakfast, reduced by the factor `shrink`, with exact cameras and 60 exact
+/// points per view.
 pub fn breakfast(shrink: u32) -> Set {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/breakfast");
     let truth = std::fs::read_to_string(root.join("ground_truth.json")).unwrap();

@@ -4,7 +4,7 @@ use splatvk_io::photo::{Photo, PlainBorder};
 use splatvk_types::scene::{Affine, RgbImage};
 use std::path::Path;
 
-/// Mean colour of the image, as embedding.
+/// Mean colour of the image as embedding.
 pub fn image_tower() -> Onnx {
     Onnx::new().input("pixel_values", FLOAT, "batch 3 16 16").output("image_embeds", "batch 3").node(
         "ReduceMean",
@@ -17,8 +17,8 @@ pub fn image_tower() -> Onnx {
 pub const WORDS: [&str; 12] =
     ["[UNK]", "red", "green", "blue", "dog", "city", "page", "text", "person", "bicycle", "plate", "food"];
 
-/// Sum of the words' rows: red, green and blue point along their channel, the rest (and padding)
-/// nowhere in particular.
+/// Sum of the rows of the words: red, green and blue point along their channel, other words and
+/// padding in a neutral direction.
 pub fn text_tower(order: [usize; 3]) -> Onnx {
     let mut table = vec![0.01f32; 3 * WORDS.len()];
     for (k, channel) in order.into_iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Rendering forward and backward, and what reads a rendered frame.
+//! Rendering forward and backward, and passes that read a rendered frame.
 use crate::support::{
     IMAGE, Scene, assert_class, assert_close, assert_gradients, assert_images, assert_lists, in_bands,
     rendered,
@@ -11,13 +11,13 @@ use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, Rasterizer};
 use splatvk::pass::{decode as decoding, pack as packing, pairs as counting};
 use splatvk::scene::seeded;
 
-/// Splats over 27 × 19 pixels: 4 × 3 tiles, those on two borders partial.
+/// Splats over 27 × 19 pixels: 4 × 3 tiles, partial on two borders.
 fn scene(n: usize, sh_degree: u32, dim: usize, seed: u64) -> Scene {
     let (splats, camera) = seeded::small(n, 27, 19, sh_degree, seed);
     Scene::new(splats, &camera, dim, seed)
 }
 
-fn there_and_back(device: &Device, scene: &Scene, ways: DeviceChoices) {
+fn check_both_directions(device: &Device, scene: &Scene, ways: DeviceChoices) {
     let (params, mut raster) = scene.upload_for(device, ways);
     raster.forward(&params, &scene.options).unwrap();
     assert_images(&rendered(&raster), &scene.reference());
@@ -25,7 +25,7 @@ fn there_and_back(device: &Device, scene: &Scene, ways: DeviceChoices) {
     assert_gradients(scene, &scene.gradients_by(device, ways, &upstream), 7);
 }
 
-/// One program.
+/// A render in one program.
 pub fn image(device: &Device) {
     let scene = scene(40, 1, 3, 1048);
     assert_images(&scene.render(device), &scene.reference());
@@ -35,23 +35,23 @@ pub fn image(device: &Device) {
 pub fn edge_cases(device: &Device) {
     for (n, width, height) in [(0, 9, 5), (1, 3, 2), (1, 17, 8)] {
         let (splats, camera) = seeded::small(n, width, height, 0, 1049);
-        there_and_back(device, &Scene::new(splats, &camera, 0, 1049), DeviceChoices::of(device));
+        check_both_directions(device, &Scene::new(splats, &camera, 0, 1049), DeviceChoices::of(device));
     }
     let mut behind = scene(3, 0, 3, 1050);
     behind.splats.means.fill((-3.0 * behind.view.position().as_vec3()).to_array());
     behind.view.translation = glam::DVec3::new(0.0, 0.0, -50.0);
-    there_and_back(device, &behind, DeviceChoices::of(device));
+    check_both_directions(device, &behind, DeviceChoices::of(device));
     let mut large = scene(12, 0, 0, 1051);
     large.splats.log_scales.fill([3.0, 2.5, 2.0]);
     large.splats.opacity_logits.fill(-3.0);
-    there_and_back(device, &large, DeviceChoices::of(device));
-    // Some lie beyond where the Jacobian is clamped, on every side, and still reach into the image.
+    check_both_directions(device, &large, DeviceChoices::of(device));
+    // Some lie beyond the clamp of the Jacobian, on every side, and still reach into the image.
     let mut beyond = scene(20, 0, 0, 1053);
     beyond.view.focal = beyond.view.focal.map(|f| 1.6 * f);
-    there_and_back(device, &beyond, DeviceChoices::of(device));
+    check_both_directions(device, &beyond, DeviceChoices::of(device));
 }
 
-/// Band by band, against the reference of the whole: 8 planes of 6000 pixels do not fit in 128 KiB.
+/// Compares bands with the reference of the whole: 8 planes of 6000 pixels exceed 128 KiB.
 pub fn bands(device: &Device) {
     let (splats, camera) = seeded::small(12, 40, 150, 0, 1052);
     let scene = Scene::new(splats, &camera, 3, 1052);
@@ -69,14 +69,14 @@ fn by_atomics(device: &Device) -> DeviceChoices {
 }
 
 pub fn colours(device: &Device) {
-    there_and_back(device, &scene(40, 3, 0, 1040), by_atomics(device));
+    check_both_directions(device, &scene(40, 3, 0, 1040), by_atomics(device));
 }
 
 pub fn few_features(device: &Device) {
-    there_and_back(device, &scene(30, 1, 3, 1041), by_atomics(device));
+    check_both_directions(device, &scene(30, 1, 3, 1041), by_atomics(device));
 }
 
-/// Without coupling between features and geometry on the way back.
+/// Without coupling between features and geometry in the backward pass.
 pub fn eight_features(device: &Device) {
     let mut scene = scene(20, 2, 8, 1047);
     scene.options.features_move_geometry = false;
@@ -86,15 +86,15 @@ pub fn eight_features(device: &Device) {
     assert_images(&rendered(&raster), &scene.reference());
     let upstream = scene.upstream(7);
     let gradients = scene.gradients_by(device, ways, &upstream);
-    // The features' own gradients are those with coupling, and the geometry's those of the other
-    // planes.
+    // Gradients of the features equal those with coupling; gradients of the geometry come from the
+    // other planes alone.
     scene.options.features_move_geometry = true;
-    let reference = scene.twin_gradients(&scene.reference(), &upstream);
+    let reference = scene.reference_gradients(&scene.reference(), &upstream);
     assert_class("features", &gradients.features, &reference.params.features);
     let mut without = upstream;
     let pixels = scene.pixels();
     without[4 * pixels..12 * pixels].fill(0.0);
-    let reference = scene.twin_gradients(&scene.reference(), &without);
+    let reference = scene.reference_gradients(&scene.reference(), &without);
     let means: Vec<f64> = reference.params.means.iter().flat_map(|m| m.to_array()).collect();
     assert_class("means", gradients.splats.means.as_flattened(), &means);
 }
@@ -103,20 +103,19 @@ pub fn eight_features(device: &Device) {
 pub fn many_features(device: &Device) {
     let mut scene = scene(25, 0, 33, 1042);
     scene.options.feature_mode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 3 };
-    there_and_back(device, &scene, by_atomics(device));
+    check_both_directions(device, &scene, by_atomics(device));
 }
 
-/// All widths of a launch that [`many_features`] leaves out, and all degrees, summed entry by
-/// entry.
+/// All widths of a launch that [`many_features`] leaves out, and all degrees, summed by entry.
 pub fn gradients_by_entry(device: &Device) {
     let ways = DeviceChoices { summation: GradientReduction::Entries, ..DeviceChoices::of(device) };
     for (n, sh_degree, dim) in [(40, 2, 0), (20, 1, 3), (20, 3, 8), (15, 0, 16), (12, 0, 37)] {
         let scene = scene(n, sh_degree, dim, 1043 + dim as u64);
-        there_and_back(device, &scene, ways);
+        check_both_directions(device, &scene, ways);
     }
 }
 
-/// Tile lists in both ways, against the reference's.
+/// Tile lists of both algorithms, compared with the reference.
 pub fn lists_by_counting(device: &Device) {
     let (total, extra) = assert_lists(device, &scene(60, 0, 0, 1044));
     assert!(total > 50 && extra * 20 < total, "{extra} of {total}");
@@ -153,7 +152,7 @@ pub fn decode(device: &Device) {
             row.iter_mut().for_each(|x| *x /= norm);
         }
         let mut planes = numbers((dim + 2) * pixels);
-        // Every third pixel has a feature about as short as those that have no code.
+        // Every third pixel has a feature about as short as those without a code.
         let length = |p: usize| if p.is_multiple_of(3) { 0.2 / (dim as f32).sqrt() } else { 1.0 };
         planes.chunks_exact_mut(pixels).for_each(|plane| {
             plane.iter_mut().enumerate().for_each(|(p, v)| *v *= length(p));
@@ -180,7 +179,7 @@ pub fn pack(device: &Device) {
     let (width, height, dim) = (19u32, 7u32, 6usize);
     let pixels = (width * height) as usize;
     let raster = Rasterizer::new(device, 1, dim, width, height).unwrap();
-    // As in src/pass/pack.rs: exact in half precision, and off the halves of rounding.
+    // As in src/pass/pack.rs: exact in half precision, and away from rounding ties.
     let noise = |i: usize| ((i * 7919 + 13) % 97) as f32 / 64.0;
     let planes: Vec<f32> = (0..(4 + dim) * pixels).map(noise).collect();
     let transmittance: Vec<f32> = (0..pixels).map(|i| (i % 9) as f32 / 8.0).collect();

@@ -144,7 +144,7 @@ pub fn codes(device: &Device) {
         rec.run().unwrap();
         frame.planes_grad.read().unwrap()
     };
-    // Nothing else than the gradients of the codes is touched.
+    // Only the gradients of the codes change.
     frame.planes_grad.write(&vec![7.0; (5 + levels * width) * pixels]).unwrap();
     let upstream = run(Mode::Loss);
     assert!(upstream[..4 * pixels].iter().all(|g| *g == 7.0));

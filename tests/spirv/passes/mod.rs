@@ -1,4 +1,4 @@
-//! Small scenes for every pass, each compared with its reference. A scene panics where a pass fails or
+//! Small scenes for every pass, each compared with its reference. A scene panics if a pass fails or
 //! differs.
 mod arrays;
 mod frames;
@@ -10,7 +10,7 @@ use splatvk::gpu::Device;
 
 pub type Scene = fn(&Device);
 
-/// Those in which nothing is added with float atomics.
+/// Scenes without float atomics.
 pub const PLAIN: &[(&str, Scene)] = &[
     ("scan", arrays::scan),
     ("gather", arrays::gather),
@@ -32,7 +32,7 @@ pub const PLAIN: &[(&str, Scene)] = &[
     ("plane sweep", stereo::plane_sweep),
 ];
 
-/// Those with float atomics.
+/// Scenes with float atomics.
 pub const ADDING: &[(&str, Scene)] = &[
     ("colours", frames::colours),
     ("3 features", frames::few_features),
@@ -40,7 +40,7 @@ pub const ADDING: &[(&str, Scene)] = &[
     ("21 features", frames::many_features),
 ];
 
-/// The scene of a name.
+/// Scene with a name.
 pub fn named(name: &str) -> Scene {
     PLAIN.iter().chain(ADDING).find(|s| s.0 == name).expect("a scene").1
 }

@@ -6,10 +6,10 @@ use splatvk::pass::plane_sweep_cpu::CpuMatcher;
 
 const SIZE: [u32; 2] = [22, 14];
 const FOCAL: f32 = 20.0;
-/// Between the two cameras, along x; the wall stands at depth 2.
+/// Distance of the two cameras along x; the wall is at depth 2.
 const BASE: f32 = 0.3;
 
-/// The other view as seen from one that lies `offset` beside it.
+/// The other view, from a camera that lies `offset` beside it.
 fn source(offset: f32, first: u32) -> SourceView {
     let (cx, cy) = (SIZE[0] as f32 / 2.0, SIZE[1] as f32 / 2.0);
     let rows = |t: f32| [[FOCAL, 0.0, cx, FOCAL * t], [0.0, FOCAL, cy, 0.0], [0.0, 0.0, 1.0, 0.0]];
@@ -24,27 +24,10 @@ fn source(offset: f32, first: u32) -> SourceView {
 
 pub fn plane_sweep(device: &Device) {
     let pixels = (SIZE[0] * SIZE[1]) as usize;
-    let shade = |x: f32, y: f32| {
-        let wave = 0.25 * (0.9 * x + 0.2 * y).sin() + 0.2 * (0.5 * x - 0.8 * y).cos();
-        // As the shaders store it.
-        ((0.5 + wave) * 65535.0).round() / 65535.0
-    };
     let view = |shift: f32| {
         (0..pixels).map(move |k| shade((k as u32 % SIZE[0]) as f32 + shift, (k as u32 / SIZE[0]) as f32))
     };
     let luma: Vec<f32> = view(0.0).chain(view(FOCAL * BASE / 2.0)).collect();
-    let reference = |k: u32| ReferenceView {
-        intrinsics: [FOCAL, FOCAL, SIZE[0] as f32 / 2.0, SIZE[1] as f32 / 2.0],
-        range: [0.2, 1.0],
-        seed: 5,
-        width: SIZE[0],
-        height: SIZE[1],
-        first: k * pixels as u32,
-        first_source: k,
-        sources: 1,
-        planes: 6,
-        ..ReferenceView::default()
-    };
     let references = [reference(0), reference(1)];
     let sources = vec![source(BASE, pixels as u32), source(-BASE, 0)];
     let start = vec![Vec4::ZERO; 2 * pixels];
@@ -68,7 +51,28 @@ pub fn plane_sweep(device: &Device) {
     }
 }
 
-/// As in src/pose/stereo/tests.rs: near ties may fall either way.
+fn reference(k: u32) -> ReferenceView {
+    ReferenceView {
+        intrinsics: [FOCAL, FOCAL, SIZE[0] as f32 / 2.0, SIZE[1] as f32 / 2.0],
+        range: [0.2, 1.0],
+        seed: 5,
+        width: SIZE[0],
+        height: SIZE[1],
+        first: k * SIZE[0] * SIZE[1],
+        first_source: k,
+        sources: 1,
+        planes: 6,
+        ..ReferenceView::default()
+    }
+}
+
+/// Luma of the wall, quantised as by the shaders.
+fn shade(x: f32, y: f32) -> f32 {
+    let wave = 0.25 * (0.9 * x + 0.2 * y).sin() + 0.2 * (0.5 * x - 0.8 * y).cos();
+    ((0.5 + wave) * 65535.0).round() / 65535.0
+}
+
+/// As in src/pose/stereo/tests.rs: near ties may resolve either way.
 fn compare(a: &[Vec4], b: &[Vec4]) {
     let same: Vec<usize> = (0..a.len())
         .filter(|&k| (a[k].truncate() - b[k].truncate()).length() < 1e-4 * a[k].truncate().length())

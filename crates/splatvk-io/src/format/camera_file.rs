@@ -1,12 +1,12 @@
-//! The content of a camera file.
+//! Content of a camera file.
 use crate::scene::{Camera, GivenCamera};
 
-/// What a camera file holds.
+/// Cameras of a file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CameraFile {
-    /// Its cameras with their lenses; no two have one name.
+    /// Cameras with their distortion; names are unique.
     pub cameras: Vec<GivenCamera>,
-    /// What of the file is not used, for the user.
+    /// Warnings for the user on parts of the file that are not used.
     pub warnings: Vec<String>,
 }
 
@@ -17,8 +17,8 @@ impl From<Vec<GivenCamera>> for CameraFile {
 }
 
 impl CameraFile {
-    /// Cameras for views that are rendered: the pinholes that remain when the lenses are taken out,
-    /// and a warning where there are lenses.
+    /// Cameras for rendered views: the undistorted pinholes, and a warning where there is
+    /// distortion.
     pub fn pinholes(self) -> (Vec<Camera>, Vec<String>) {
         let mut warnings = self.warnings;
         let lensed = self.cameras.iter().filter(|c| !c.lens.is_none()).count();

@@ -1,4 +1,4 @@
-//! Camera files: one reader for every kind, the project's own `cameras.json`.
+//! Camera files: one reader for every kind, and the project's own `cameras.json`.
 use super::camera_file::CameraFile;
 use super::{colmap, transforms};
 use crate::photo::{self, MaskChoice};
@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::{Component, Path, PathBuf};
 
-/// Reads the cameras of a file that must be pinholes, see [`read_file`].
+/// Reads the cameras of a file that must have no distortion, see [`read_file`].
 pub fn read(path: &Path) -> Result<Vec<Camera>> {
     let cameras = read_file(path)?.cameras;
     match cameras.iter().find(|c| !c.lens.is_none()) {
@@ -23,16 +23,16 @@ pub fn read(path: &Path) -> Result<Vec<Camera>> {
 }
 
 /// Reads cameras from nerfstudio `transforms.json`, `cameras.json`, a COLMAP model (text or
-/// binary), or the folder of a data set or scene that holds one of them.
+/// binary), or the folder of a data set or scene that contains one of them.
 pub fn read_file(path: &Path) -> Result<CameraFile> {
     if path.is_dir() {
-        return of_folder(path);
+        return read_folder(path);
     }
-    // A file of a model stands for the model.
+    // A file of a COLMAP model stands for the whole model.
     let is_of_model =
         |p: &Path| colmap::FILES.as_flattened().iter().any(|f| p.file_name().is_some_and(|n| n == *f));
     if let Some(folder) = path.parent().filter(|folder| is_of_model(path) && colmap::is_model(folder)) {
-        return of_folder(folder);
+        return read_folder(folder);
     }
     let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
     let text = files::read_text(path)?;
@@ -58,9 +58,9 @@ pub fn read_file(path: &Path) -> Result<CameraFile> {
     Ok(file)
 }
 
-fn of_folder(folder: &Path) -> Result<CameraFile> {
+fn read_folder(folder: &Path) -> Result<CameraFile> {
     let Some(model) = colmap::find(folder) else {
-        // A scene directory keeps them below.
+        // A scene directory keeps them in a subfolder.
         let files =
             ["transforms.json", "cameras/transforms.json", "cameras.json"].map(|name| folder.join(name));
         return match files.iter().find(|file| file.is_file()) {
@@ -76,7 +76,8 @@ fn of_folder(folder: &Path) -> Result<CameraFile> {
     Ok(CameraFile { cameras, warnings: other_models(&model) })
 }
 
-/// COLMAP numbers the parts of a reconstruction that it could not join.
+/// Warns of further models: COLMAP writes the parts of a reconstruction that it could not join into
+/// numbered folders.
 fn other_models(model: &Path) -> Vec<String> {
     let numbered = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().parse::<u32>().is_ok());
     let entries =
@@ -93,7 +94,7 @@ fn other_models(model: &Path) -> Vec<String> {
     )]
 }
 
-/// Refuses two cameras of one name: nothing could say which of them is that of a photo.
+/// Refuses two cameras of one name, as a photo could not be assigned to one of them.
 fn check_names(cameras: &[GivenCamera]) -> Result<(), String> {
     let mut seen: HashMap<String, &str> = HashMap::new();
     for c in cameras {
@@ -104,7 +105,7 @@ fn check_names(cameras: &[GivenCamera]) -> Result<(), String> {
     Ok(())
 }
 
-/// Where the masks of photos come from: a folder, and what a camera file names (`mask_path` of
+/// Mask files of photos: a folder, and the masks that a camera file names (`mask_path` of
 /// transforms.json).
 pub fn masks(folder: Option<&Path>, cameras: Option<&Path>) -> Result<MaskChoice> {
     let mut choice = MaskChoice { folder: folder.map(Path::to_path_buf), named: Vec::new() };
@@ -120,7 +121,7 @@ pub fn masks(folder: Option<&Path>, cameras: Option<&Path>) -> Result<MaskChoice
     let beside = file.parent().unwrap_or(Path::new("."));
     for (photo, mask) in transforms::masks(&text).map_err(bad)? {
         let path = Path::new(&mask);
-        // Other files are read only from the folder of the one that names them.
+        // Files outside the folder of the camera file are not read.
         if !path.components().all(|c| matches!(c, Component::Normal(_) | Component::CurDir)) {
             return Err(bad(format!(
                 "frame {photo:?}: mask_path {mask:?} leads out of the file's folder; put the mask beside the file, or give \
@@ -139,7 +140,7 @@ pub fn masks(folder: Option<&Path>, cameras: Option<&Path>) -> Result<MaskChoice
     Ok(choice)
 }
 
-/// One camera of `cameras.json`: the layout 3DGS tools write, plus the principal point.
+/// One camera of `cameras.json`: the layout of 3DGS tools, plus the principal point.
 #[derive(Debug, Serialize, Deserialize)]
 struct Entry {
     #[serde(default)]
@@ -160,6 +161,21 @@ struct Entry {
 }
 
 impl Entry {
+    fn new(id: usize, c: &Camera) -> Entry {
+        Entry {
+            id: Some(id as u32),
+            img_name: c.name.clone(),
+            width: c.width,
+            height: c.height,
+            position: c.pose.centre().to_array(),
+            rotation: c.pose.rotation.to_cols_array_2d(),
+            fx: c.fx,
+            fy: c.fy,
+            cx: Some(c.cx),
+            cy: Some(c.cy),
+        }
+    }
+
     fn camera(self) -> Result<GivenCamera, String> {
         // The rows of camera → world are the columns of world → camera.
         let rotation = DMat3::from_cols_array_2d(&self.rotation);
@@ -180,18 +196,6 @@ impl Entry {
 
 /// Writes `cameras.json`.
 pub fn write_json(path: &Path, cameras: &[Camera]) -> Result<()> {
-    let entry = |(id, c): (usize, &Camera)| Entry {
-        id: Some(id as u32),
-        img_name: c.name.clone(),
-        width: c.width,
-        height: c.height,
-        position: c.pose.centre().to_array(),
-        rotation: c.pose.rotation.to_cols_array_2d(),
-        fx: c.fx,
-        fy: c.fy,
-        cx: Some(c.cx),
-        cy: Some(c.cy),
-    };
-    let entries: Vec<Entry> = cameras.iter().enumerate().map(entry).collect();
+    let entries: Vec<Entry> = cameras.iter().enumerate().map(|(id, c)| Entry::new(id, c)).collect();
     super::write_json(path, &entries)
 }

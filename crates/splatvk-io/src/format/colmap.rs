@@ -7,14 +7,14 @@ use std::collections::HashMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Whether a folder holds a text or binary model.
+/// Whether a folder contains a text or binary model.
 pub fn is_model(folder: &Path) -> bool {
     ["txt", "bin"]
         .iter()
         .any(|e| ["cameras", "images"].iter().all(|n| folder.join(format!("{n}.{e}")).is_file()))
 }
 
-/// Where programs keep a model below the folder of a data set or a scene.
+/// Usual places of a model below the folder of a data set or a scene.
 const BELOW: [&str; 12] = [
     "",
     "sparse/0",
@@ -30,14 +30,13 @@ const BELOW: [&str; 12] = [
     "undistorted/sparse",
 ];
 
-/// The folder of the model of a data set: the folder itself or the first of those below it that
-/// [`is_model`].
+/// Folder of the model of a data set: the first of [`BELOW`] that [`is_model`].
 pub fn find(folder: &Path) -> Option<PathBuf> {
     BELOW.iter().map(|below| folder.join(below)).find(|f| is_model(f))
 }
 
-/// Files of a model as text and of one in binary, in the order in which those of the other form go:
-/// a model is read as text as long as its images are there as text.
+/// Files of a text and of a binary model. Order in which the files of the other form are deleted: a
+/// model is read as text as long as its images exist as text.
 pub const FILES: [[&str; 3]; 2] =
     [["images.txt", "cameras.txt", "points3D.txt"], ["images.bin", "cameras.bin", "points3D.bin"]];
 
@@ -46,7 +45,7 @@ struct Intrinsics {
     optics: Optics,
 }
 
-/// Cameras by their number; of those whose lens is not read, why.
+/// Cameras by their id; an error where the camera model is not supported.
 type Intrinsic = HashMap<u32, Result<Intrinsics, String>>;
 
 fn intrinsics(
@@ -71,15 +70,11 @@ fn intrinsics(
     }
 }
 
-/// Reads the cameras of a model folder with their lenses, in the order of its image numbers.
+/// Reads the cameras of a model folder with their distortion, in the order of its image ids.
 pub fn read(folder: &Path) -> Result<Vec<GivenCamera>> {
     let text = folder.join("images.txt").is_file();
     let ext = if text { "txt" } else { "bin" };
     let (cameras, images) = (folder.join(format!("cameras.{ext}")), folder.join(format!("images.{ext}")));
-    let named = |p: &Path| {
-        let p = p.display().to_string();
-        move |e: String| Error::input(format!("{p}: {e}"))
-    };
     let (camera_bytes, image_bytes) = (files::read(&cameras)?, files::read(&images)?);
     let (intrinsics, mut shots) = if text {
         (
@@ -98,9 +93,15 @@ pub fn read(folder: &Path) -> Result<Vec<GivenCamera>> {
         let missing = || format!("image {:?} names camera {}, which is missing", shot.name, shot.camera);
         let own = intrinsics.get(&shot.camera).ok_or_else(missing).map_err(named(&images))?;
         let own = own.as_ref().map_err(|e| named(&cameras)(e.clone()))?;
-        out.push(shot.seen_by(own).checked().map_err(named(&images))?);
+        out.push(shot.with_intrinsics(own).checked().map_err(named(&images))?);
     }
     if out.is_empty() { Err(named(&images)("the model has no images".into())) } else { Ok(out) }
+}
+
+/// Attaches the path of a file to a message.
+fn named(path: &Path) -> impl Fn(String) -> Error {
+    let path = path.display().to_string();
+    move |e| Error::input(format!("{path}: {e}"))
 }
 
 struct Shot {
@@ -112,7 +113,7 @@ struct Shot {
 }
 
 impl Shot {
-    fn seen_by(self, own: &Intrinsics) -> GivenCamera {
+    fn with_intrinsics(self, own: &Intrinsics) -> GivenCamera {
         let rotation =
             DMat3::from_quat(DQuat::from_xyzw(self.q[1], self.q[2], self.q[3], self.q[0]).normalize());
         let pose = Pose { rotation, translation: DVec3::from_array(self.t) };
@@ -127,12 +128,12 @@ fn number<T: std::str::FromStr>(word: Option<&str>, line: usize) -> Result<T, St
         .ok_or_else(|| format!("line {line}: {:?} is not a number", word.unwrap_or("")))
 }
 
-/// Lines that are no comments, with their numbers from 1.
+/// Lines that are no comments, with line numbers from 1.
 fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
     text.lines().enumerate().map(|(i, line)| (i + 1, line.trim())).filter(|(_, line)| !line.starts_with('#'))
 }
 
-/// The next word and what follows it; words are apart by any number of blanks and tabs.
+/// Next word and the rest of the line; any number of blanks and tabs separates words.
 fn split(line: &str) -> (Option<&str>, &str) {
     let line = line.trim_start();
     let end = line.find(char::is_whitespace).unwrap_or(line.len());
@@ -163,15 +164,15 @@ fn text_cameras(bytes: &[u8], folder: &Path) -> Result<Intrinsic, String> {
     Ok(out)
 }
 
-/// Whether a line is the 2D points of the image before it, numbers in threes; an image has nine and
-/// a name.
+/// Whether a line holds the 2D points of the preceding image: numbers in threes. An image line has
+/// nine numbers and a name.
 fn is_points(line: &str) -> bool {
     let words = line.split_whitespace();
     words.clone().count().is_multiple_of(3) && words.into_iter().all(|w| w.parse::<f64>().is_ok())
 }
 
 fn text_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
-    // Two lines an image; the second (2D points) is often empty, and some programs leave it out.
+    // Two lines per image; the second (2D points) is often empty, and some programs leave it out.
     let mut out = Vec::new();
     let mut points_may_follow = false;
     for (i, line) in lines(files::plain_text(bytes)?) {
@@ -191,7 +192,7 @@ fn text_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
         }
         let [qw, qx, qy, qz, x, y, z] = seven;
         let camera = number(word(), i)?;
-        // The name is all that is left: it may have blanks.
+        // The name is the rest of the line: it may contain blanks.
         let name = rest.trim().to_string();
         if name.is_empty() {
             return Err(format!("line {i}: the name of the image is missing"));
@@ -202,7 +203,7 @@ fn text_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
     Ok(out)
 }
 
-/// Little-endian cursor over a file that may lie about its counts.
+/// Little-endian cursor over a file whose counts may be wrong.
 struct Bytes<'a>(&'a [u8]);
 
 impl<'a> Bytes<'a> {
@@ -269,8 +270,8 @@ fn binary_images(bytes: &[u8]) -> Result<Vec<Shot>, String> {
     Ok(out)
 }
 
-/// Reads `points3D.txt` or `points3D.bin` of a model folder or of a data set that holds one;
-/// confidence 1, radius 0.
+/// Reads `points3D.txt` or `points3D.bin` of a model folder or of a data set with one; confidence
+/// 1, radius 0.
 pub fn read_points(folder: &Path) -> Result<PointCloud> {
     let files = BELOW
         .iter()
@@ -322,8 +323,8 @@ fn binary_points(bytes: &[u8]) -> Result<Vec<Point>, String> {
     Ok(out)
 }
 
-/// Most points that `points3D.txt` gets: other tools only start from them, and text takes 70 bytes
-/// a point.
+/// Largest number of points in `points3D.txt`: other tools only start from them, and text takes 70
+/// bytes a point.
 const MAX_POINTS: usize = 100_000;
 
 /// Writes a text model with PINHOLE cameras. Rust prints the shortest digits that read back
@@ -332,8 +333,8 @@ pub fn write(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> 
     write_text(folder, cameras, None, points)
 }
 
-/// Writes a text model of photos as they were taken: one lens per camera, as OPENCV, FULL_OPENCV or
-/// OPENCV_FISHEYE.
+/// Writes a text model of the distorted photos: one distortion per camera, as OPENCV, FULL_OPENCV
+/// or OPENCV_FISHEYE.
 pub fn write_lensed(folder: &Path, cameras: &[Camera], lenses: &[Lens]) -> Result<()> {
     write_text(folder, cameras, Some(lenses), None)
 }
@@ -379,10 +380,14 @@ fn write_text(
     Ok(())
 }
 
-/// Writes a binary model with PINHOLE cameras, and all points: only text needs many bytes for them.
+/// Bytes of a count in a binary model.
+fn count(n: usize) -> [u8; 8] {
+    (n as u64).to_le_bytes()
+}
+
+/// Writes a binary model with PINHOLE cameras and all points: binary points are small.
 pub fn write_binary(folder: &Path, cameras: &[Camera], points: Option<&PointCloud>) -> Result<()> {
     std::fs::create_dir_all(folder).map_err(Error::unwritable(folder))?;
-    let count = |n: usize| (n as u64).to_le_bytes();
     let mut intrinsics = count(cameras.len()).to_vec();
     let mut images = intrinsics.clone();
     for (id, c) in (1u32..).zip(cameras) {
@@ -403,7 +408,7 @@ pub fn write_binary(folder: &Path, cameras: &[Camera], points: Option<&PointClou
         cloud.extend(count(id + 1));
         cloud.extend(position.iter().flat_map(|v| f64::from(*v).to_le_bytes()));
         cloud.extend(colour.map(super::to_byte));
-        // No reprojection error and no track: the points are those of stereo.
+        // No reprojection error and no track: the points come from stereo.
         cloud.extend(0f64.to_le_bytes());
         cloud.extend(count(0));
     }

@@ -1,9 +1,10 @@
-//! What several formats need.
+//! Helpers of several formats.
 use crate::files::Partial;
 use crate::{Error, Result};
 use std::path::Path;
 
-/// The raw parameter of an opacity; 0 and 1 give the largest ones that f32 tells from them.
+/// Inverse sigmoid of an opacity; 0 and 1 give the most extreme logits at which f32 opacities still
+/// differ from 0 and 1.
 pub fn logit(a: f32) -> f32 {
     let a = a.clamp(1e-7, 1.0 - 1e-7);
     (a / (1.0 - a)).ln()
@@ -26,8 +27,8 @@ pub fn create_folder(path: &Path) -> Result<()> {
     std::fs::create_dir_all(path).map_err(Error::unwritable(path))
 }
 
-/// Writes a file beside its target and renames it: one that was there stays until the new one is
-/// whole. Makes its folder.
+/// Writes a file beside its target and renames it: an existing file stays until the new one is
+/// complete. Creates its folder.
 pub fn write_whole_file(out: &Path, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
     let partial = Partial::beside(out)?;
     write(partial.path())?;

@@ -1,5 +1,5 @@
-//! Files of Gaussians: one reader and one writer for every format, chosen by the end of the file's
-//! name or by the format's.
+//! Files of Gaussians: one reader and one writer for every format, chosen by the ending of the
+//! file's name or by the name of the format.
 mod degree;
 pub mod gltf;
 mod other;
@@ -22,25 +22,25 @@ use std::path::{Path, PathBuf};
 
 /// A format of Gaussians.
 pub struct SplatFormat {
-    /// As `splatvk export --format` takes it.
+    /// Name for `splatvk export --format`.
     pub name: &'static str,
-    /// What it is.
+    /// Description in the help text.
     pub about: &'static str,
-    /// End of the files' names.
+    /// Ending of the file names.
     pub ending: &'static str,
-    /// Brightest base colour that it holds; `None` = any.
+    /// Brightest base colour that it represents; `None` = any.
     pub brightest: Option<f32>,
-    /// Its axes are right, up, back by definition; the others hold whatever axes a scene has.
+    /// Whether its axes are right, up, back by definition; other formats use the axes of the scene.
     pub y_up: bool,
-    /// Whether it states that Gaussians are antialiased ([`Splats::antialiased`]).
+    /// Whether it stores that Gaussians are antialiased ([`Splats::antialiased`]).
     pub states_filter: bool,
-    /// Adds a line to the notes for what is not read.
+    /// Reads a file; appends a note on each part that is not read.
     read: fn(&Path, &mut Vec<String>) -> Result<Splats>,
-    /// Returns the order of the rows; empty = the scene's own.
+    /// Writes a file; returns the order of the rows; empty = the scene's own.
     write: fn(&Path, &Splats, WriteOptions) -> Result<Vec<u32>>,
 }
 
-/// What a format leaves open.
+/// Parameters that the formats leave open.
 #[derive(Clone, Copy, Debug)]
 pub struct WriteOptions {
     /// Version of `.spz`, one of [`spz::VERSIONS`].
@@ -53,7 +53,7 @@ impl Default for WriteOptions {
     }
 }
 
-/// All formats; an ending comes before those that it ends with.
+/// All formats; an ending stands before its own suffixes (".compressed.ply" before ".ply").
 pub static FORMATS: [SplatFormat; 6] = [
     SplatFormat {
         name: "compressed-ply",
@@ -118,7 +118,7 @@ pub static FORMATS: [SplatFormat; 6] = [
 ];
 
 impl SplatFormat {
-    /// The one of a name.
+    /// Format with a name.
     pub fn named(name: &str) -> Option<&'static SplatFormat> {
         FORMATS.iter().find(|f| f.name == name)
     }
@@ -129,12 +129,12 @@ fn find(path: &Path) -> Option<&'static SplatFormat> {
     FORMATS.iter().find(|k| name.ends_with(k.ending))
 }
 
-/// Whether the name is one of a file of Gaussians.
+/// Whether the name is that of a file of Gaussians.
 pub fn is_named(path: &Path) -> bool {
     find(path).is_some()
 }
 
-/// The format that the name of a file says.
+/// Format by the ending of a file's name.
 pub fn format(path: &Path) -> Result<&'static SplatFormat> {
     find(path).ok_or_else(|| {
         let (place, endings) = (path.display(), endings());
@@ -143,18 +143,18 @@ pub fn format(path: &Path) -> Result<&'static SplatFormat> {
     })
 }
 
-/// The endings of all formats, for messages.
+/// Endings of all formats, for messages.
 pub fn endings() -> String {
     FORMATS.iter().map(|k| k.ending).collect::<Vec<_>>().join(", ")
 }
 
-/// Reads a file of Gaussians, and the language beside it, if any. Gaussians that cannot be computed
-/// with (numbers that are not finite or beyond 1e18, no rotation) are left out.
+/// Reads a file of Gaussians, and the language beside it, if any. Unusable Gaussians (numbers that
+/// are not finite or beyond 1e18, no rotation) are left out.
 pub fn read(path: &Path) -> Result<(Splats, Option<LanguageField>)> {
     read_noted(path).map(|(splats, language, _)| (splats, language))
 }
 
-/// [`read`], and what was left out of the file or not applied, a line each.
+/// Like [`read`]; also returns notes on parts that were left out or not applied, a line each.
 pub fn read_noted(path: &Path) -> Result<(Splats, Option<LanguageField>, Vec<String>)> {
     let format = format(path)?;
     if let Some(e) = other::misnamed(path, format.name, format.ending) {
@@ -168,13 +168,13 @@ pub fn read_noted(path: &Path) -> Result<(Splats, Option<LanguageField>, Vec<Str
     Ok((splats, language, usable::finished(notes, path)))
 }
 
-/// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if they have any;
-/// ordinary files that are there are replaced.
+/// Writes a file of Gaussians, and beside it ([`side_file`]) their language, if any; replaces
+/// existing regular files.
 pub fn write(path: &Path, splats: &Splats, language: Option<&LanguageField>) -> Result<()> {
     write_as(path, splats, language, format(path)?, WriteOptions::default())
 }
 
-/// [`write()`] in a format, whatever the file is called.
+/// Like [`write()`], in a given format, whatever the name of the file.
 pub fn write_as(
     path: &Path,
     splats: &Splats,
@@ -185,8 +185,8 @@ pub fn write_as(
     Reserved::open(path, true)?.write(splats, language, format, options)
 }
 
-/// The places of a file of Gaussians and of the language beside it, to which nobody else writes as
-/// long as this lives.
+/// Reserved places of a file of Gaussians and of the language beside it: nobody else writes to them
+/// while this value lives.
 #[derive(Debug)]
 pub struct Reserved {
     path: PathBuf,
@@ -197,7 +197,7 @@ pub struct Reserved {
 }
 
 impl Reserved {
-    /// Refuses places that may not be written over.
+    /// Reserves the places; refuses files that may not be overwritten.
     pub fn open(path: &Path, force: bool) -> Result<Reserved> {
         let side = side_file::path(path);
         check_place(path, Kind::File, force)?;
@@ -206,7 +206,7 @@ impl Reserved {
         Ok(Reserved { path: path.to_path_buf(), side, force, splat_file, language_file })
     }
 
-    /// Writes both files, or the one where there is no language.
+    /// Writes both files, or only the first where there is no language.
     pub fn write(
         self,
         splats: &Splats,
@@ -215,8 +215,7 @@ impl Reserved {
         options: WriteOptions,
     ) -> Result<()> {
         let with_codes = language.filter(|l| l.levels.iter().any(|l| !l.codebook.is_empty()));
-        // What a format cannot hold is said of the place that was asked for, not of the file beside
-        // it.
+        // An error of the format names the requested place, not the temporary file beside it.
         let order = (format.write)(self.splat_file.path(), splats, options).map_err(|e| match e {
             Error::Input(what) => Error::input(format!("{}: {what}", self.path.display())),
             other => other,
@@ -224,18 +223,21 @@ impl Reserved {
         if let Some(field) = with_codes {
             side_file::write(self.language_file.path(), field, splats.len(), &order)?;
         }
-        // Both are written. What came there meanwhile is not ours.
+        // Both are complete. Files that came to the places meanwhile are not overwritten without
+        // `force`.
         check_place(&self.path, Kind::File, self.force)?;
         check_place(&self.side, Kind::File, self.force)?;
-        // Wherever a kill comes between these moves, no file has the language of another one beside
-        // it.
+        // If the process is killed between the moves, a file may lack its language but never has
+        // that of another one.
         if self.side.is_file() {
             std::fs::remove_file(&self.side).map_err(Error::unwritable(&self.side))?;
         }
-        let place = |file: Partial, place: &Path| {
-            file.finish(|from| std::fs::rename(from, place).map_err(Error::unwritable(place)))
-        };
-        place(self.splat_file, &self.path)?;
-        with_codes.map_or(Ok(()), |_| place(self.language_file, &self.side))
+        move_to(self.splat_file, &self.path)?;
+        with_codes.map_or(Ok(()), |_| move_to(self.language_file, &self.side))
     }
+}
+
+/// Moves a finished file to its place.
+fn move_to(file: Partial, place: &Path) -> Result<()> {
+    file.finish(|from| std::fs::rename(from, place).map_err(Error::unwritable(place)))
 }

@@ -1,4 +1,4 @@
-//! The names that COLMAP and nerfstudio give camera models, and which of their lenses are read.
+//! Camera models of COLMAP and nerfstudio, and the supported ones.
 use crate::scene::Lens;
 
 /// A camera model of COLMAP.
@@ -6,7 +6,7 @@ pub(super) struct LensModel {
     pub name: &'static str,
     /// Names of its parameters, as COLMAP's `params_info` lists them.
     parameters: &'static str,
-    /// How its distortion is read; `None`: not at all.
+    /// Projection of its distortion; `None` = not supported.
     reads: Option<Projection>,
 }
 
@@ -28,7 +28,7 @@ const fn unread(name: &'static str, parameters: &'static str) -> LensModel {
     LensModel { name, parameters, reads: None }
 }
 
-/// In the order of COLMAP's numbers (4.2.1).
+/// All models, in the order of COLMAP's numbers (4.2.1).
 const MODELS: [LensModel; 18] = [
     model("SIMPLE_PINHOLE", "f cx cy"),
     model("PINHOLE", "fx fy cx cy"),
@@ -50,7 +50,7 @@ const MODELS: [LensModel; 18] = [
     unread("EQUIRECTANGULAR", "w h"),
 ];
 
-/// Focal lengths, principal point and lens, pixels.
+/// Focal lengths, principal point and distortion, pixels.
 #[derive(Clone, Copy)]
 pub(super) struct Optics {
     pub f: [f64; 2],
@@ -67,23 +67,23 @@ impl LensModel {
         MODELS.get(number)
     }
 
-    /// How many parameters it has.
+    /// Number of parameters.
     pub fn parameters(&self) -> usize {
         self.parameters.split(' ').count()
     }
 
-    /// Whether its lens is read.
+    /// Whether its distortion is supported.
     pub fn is_read(&self) -> bool {
         self.reads.is_some()
     }
 
-    /// Whether it is a fisheye that is read.
+    /// Whether it is a supported fisheye.
     pub fn is_fisheye(&self) -> bool {
         self.reads == Some(Projection::Fisheye)
     }
 
-    /// The optics that a list of its parameters states; `None` where its lens is not read or the
-    /// list has another length.
+    /// Intrinsics from a list of its parameters; `None` where its distortion is not supported or
+    /// the list has another length.
     pub fn optics(&self, values: &[f64]) -> Option<Optics> {
         if !self.is_read() || values.len() != self.parameters() {
             return None;
@@ -112,8 +112,8 @@ impl LensModel {
     }
 }
 
-/// The model that holds a lens with the fewest parameters of those that other programs know: its
-/// name and its distortion.
+/// Name and coefficients of the model with the fewest parameters that represents a distortion, of
+/// those that other programs support.
 pub(super) fn of_lens(lens: &Lens) -> (&'static str, Vec<f64>) {
     let Lens { k1, k2, k3, k4, k5, k6, p1, p2, fisheye } = *lens;
     if fisheye {
@@ -125,7 +125,7 @@ pub(super) fn of_lens(lens: &Lens) -> (&'static str, Vec<f64>) {
     }
 }
 
-/// Names of the models that are read, for messages.
+/// Names of the supported models, for messages.
 pub(super) fn read_names() -> String {
     MODELS.iter().filter(|m| m.is_read()).map(|m| m.name).collect::<Vec<_>>().join(", ")
 }

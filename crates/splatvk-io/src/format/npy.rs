@@ -8,7 +8,7 @@ use std::path::Path;
 
 const MAGIC: &[u8] = b"\x93NUMPY";
 
-/// Most bytes of the header of an array in an archive: NumPy's own have 128, and it refuses headers
+/// Longest header of an array in an archive, bytes: NumPy's own have 128, and it refuses headers
 /// beyond 10,000.
 const LONGEST_HEADER: u64 = 1 << 16;
 
@@ -149,13 +149,13 @@ pub fn write(path: impl AsRef<Path>, array: &NpyArray) -> Result<()> {
     std::fs::write(path, bytes).map_err(Error::unwritable(path))
 }
 
-/// Reads every `.npy` member of an `.npz` file, by name without the extension. A file that holds
-/// more than 16 times its bytes and 64 MiB is refused.
+/// Reads every `.npy` member of an `.npz` file, by name without the extension. Refuses content of
+/// more than 16 times the bytes of the file plus 64 MiB.
 pub fn read_npz(path: impl AsRef<Path>) -> Result<BTreeMap<String, NpyArray>> {
     read_npz_of(path.as_ref(), 0)
 }
 
-/// [`read_npz`] of what `rows` splats carry, which may compress to almost nothing.
+/// Like [`read_npz`], for data of `rows` splats, which may compress to almost nothing.
 pub(super) fn read_npz_of(path: &Path, rows: usize) -> Result<BTreeMap<String, NpyArray>> {
     let bytes = files::read(path)?;
     // Three levels with two codes of four bytes, a share and a reliability.
@@ -164,7 +164,7 @@ pub(super) fn read_npz_of(path: &Path, rows: usize) -> Result<BTreeMap<String, N
         Error::input(format!("{}: {what}; copy the file again or make it anew", path.display()))
     };
     let damaged = |e: zip::result::ZipError| bad(format!("not a readable npz (zip) file ({e})"));
-    let unpacked = || -> Result<BTreeMap<String, NpyArray>> {
+    let read_members = || -> Result<BTreeMap<String, NpyArray>> {
         let mut archive = zip::ZipArchive::new(Cursor::new(bytes.as_slice())).map_err(damaged)?;
         let mut out = BTreeMap::new();
         for k in 0..archive.len() {
@@ -178,11 +178,11 @@ pub(super) fn read_npz_of(path: &Path, rows: usize) -> Result<BTreeMap<String, N
         }
         Ok(out)
     };
-    files::guarded(unpacked).unwrap_or_else(|panic| Err(bad(format!("damaged ({panic})"))))
+    files::guarded(read_members).unwrap_or_else(|panic| Err(bad(format!("damaged ({panic})"))))
 }
 
-/// A whole member of at most `left` bytes: its header first, which tells how many bytes of values
-/// belong to it.
+/// Reads a whole member of at most `left` bytes: its header first, which states the number of bytes
+/// of its values.
 fn read_member(member: &mut impl Read, left: u64) -> Result<Vec<u8>, String> {
     let damaged = |e: std::io::Error| format!("damaged ({e})");
     let mut bytes = Vec::new();
@@ -202,24 +202,24 @@ fn read_member(member: &mut impl Read, left: u64) -> Result<Vec<u8>, String> {
     if total > left {
         return Err(format!("{size} bytes of values are far more than the file can hold"));
     }
-    // One byte more shows that something follows, and lets the archive check the sum.
+    // One byte more detects trailing data, and makes the archive verify the checksum.
     bytes.reserve_exact(size as usize + 1);
     member.take(total - bytes.len() as u64 + 1).read_to_end(&mut bytes).map_err(damaged)?;
     Ok(bytes)
 }
 
-/// Writes an `.npz` file, stored without compression so that readers can map it.
+/// Writes an `.npz` file, uncompressed so that readers can map it.
 pub fn write_npz(path: impl AsRef<Path>, arrays: &[(&str, &NpyArray)]) -> Result<()> {
     write_zip(path.as_ref(), arrays, zip::CompressionMethod::Stored)
 }
 
-/// The same, compressed (as `numpy.savez_compressed`).
+/// Writes a compressed `.npz` file (as `numpy.savez_compressed`).
 pub fn write_packed_npz(path: impl AsRef<Path>, arrays: &[(&str, &NpyArray)]) -> Result<()> {
     write_zip(path.as_ref(), arrays, zip::CompressionMethod::Deflated)
 }
 
-/// In memory first: a `ZipWriter` whose disk is full goes on writing when it is dropped, prints of
-/// its own accord what comes of that, and panics where the place makes no sense.
+/// Writes an archive through memory: with a full disk, a `ZipWriter` continues to write when it is
+/// dropped, prints the resulting errors itself, and may panic at an invalid position.
 fn write_zip(path: &Path, arrays: &[(&str, &NpyArray)], method: zip::CompressionMethod) -> Result<()> {
     let failed = |e: &dyn std::fmt::Display| {
         Error::work(format!("{}: cannot write the npz file: {e}", path.display()))
@@ -267,24 +267,24 @@ pub fn encode(array: &NpyArray) -> Result<Vec<u8>> {
 
 /// Parses a `.npy` file image; `origin` names it in errors.
 pub fn decode(bytes: &[u8], origin: &str) -> Result<NpyArray> {
-    let parse = || -> Result<NpyArray, String> {
-        let header = Header::parse(bytes)?;
-        let (size, found) = (header.size()?, &bytes[header.end..]);
-        match (found.len() as u64).cmp(&size) {
-            Ordering::Less => Err(format!(
-                "truncated, {size} bytes of values expected, {} found; copy it again",
-                found.len()
-            )),
-            Ordering::Greater => {
-                Err(format!("{size} bytes of values expected, more follow; copy it again or save it anew"))
-            }
-            Ordering::Equal => Ok(NpyArray { data: parse_values(header.descr, found), shape: header.shape }),
-        }
-    };
-    parse().map_err(|what| Error::input(format!("{origin}: {what}")))
+    parse(bytes).map_err(|what| Error::input(format!("{origin}: {what}")))
 }
 
-/// Where the values begin, by the first bytes of a file.
+fn parse(bytes: &[u8]) -> Result<NpyArray, String> {
+    let header = Header::parse(bytes)?;
+    let (size, found) = (header.size()?, &bytes[header.end..]);
+    match (found.len() as u64).cmp(&size) {
+        Ordering::Less => {
+            Err(format!("truncated, {size} bytes of values expected, {} found; copy it again", found.len()))
+        }
+        Ordering::Greater => {
+            Err(format!("{size} bytes of values expected, more follow; copy it again or save it anew"))
+        }
+        Ordering::Equal => Ok(NpyArray { data: parse_values(header.descr, found), shape: header.shape }),
+    }
+}
+
+/// Offset of the values, from the first bytes of a file.
 fn preamble(bytes: &[u8]) -> Result<usize, String> {
     if bytes.len() < 10 || &bytes[..6] != MAGIC {
         return Err("not a NumPy array file (wrong magic bytes); copy it again or save it anew".to_owned());
@@ -297,11 +297,11 @@ fn preamble(bytes: &[u8]) -> Result<usize, String> {
     (length as usize).checked_add(12).ok_or_else(|| "its npy header is too long".to_owned())
 }
 
-/// What a file states of its values.
+/// Header of an array.
 struct Header<'a> {
     descr: &'a str,
     shape: Vec<usize>,
-    /// Where the values begin.
+    /// Offset of the values.
     end: usize,
 }
 
@@ -319,7 +319,7 @@ impl Header<'_> {
         Ok(Header { descr, shape, end })
     }
 
-    /// Bytes of all values.
+    /// Size of all values, bytes.
     fn size(&self) -> Result<u64, String> {
         let one = self.value_bytes()? as u64;
         let total = self.shape.iter().try_fold(one, |n, d| n.checked_mul(*d as u64));
@@ -347,7 +347,7 @@ impl Header<'_> {
     }
 }
 
-/// The text after `'name':` in the header's Python dictionary.
+/// Text after `'name':` in the header's Python dictionary.
 fn field<'a>(header: &'a str, name: &str) -> Option<&'a str> {
     let at = header.find(&format!("'{name}'"))?;
     header[at + name.len() + 2..].trim_start().strip_prefix(':').map(str::trim_start)
@@ -362,8 +362,7 @@ fn parse_shape(header: &str) -> Option<Vec<usize>> {
     inside.split(',').map(str::trim).filter(|s| !s.is_empty()).map(|s| s.parse().ok()).collect()
 }
 
-/// The values of a type that [`Header::value_bytes`] knows; `bytes` are theirs, no more and no
-/// fewer.
+/// Values of a type that [`Header::value_bytes`] accepts; `bytes` are exactly theirs.
 fn parse_values(descr: &str, bytes: &[u8]) -> NpyData {
     macro_rules! values {
         ($variant:ident, $t:ty) => {
@@ -392,7 +391,7 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn a_full_disk_is_an_error() {
+    fn full_disk_is_error() {
         let array = NpyArray::f32(&[2], vec![1.0, 2.0]);
         let error = write_packed_npz("/dev/full", &[("a", &array)]).unwrap_err();
         assert!(error.exit_code() == 2 && error.to_string().contains("the disk is full"), "{error}");
@@ -451,7 +450,7 @@ mod tests {
         assert!(more.contains("more follow"), "{more}");
     }
 
-    /// An archive of one member; `change` may damage its bytes.
+    /// Error for an archive of one member, whose bytes `change` may damage.
     fn archive(path: &Path, member: &[&[u8]], change: impl Fn(&mut Vec<u8>)) -> String {
         let method = zip::CompressionMethod::Deflated;
         let options = zip::write::SimpleFileOptions::default().compression_method(method);
@@ -467,7 +466,7 @@ mod tests {
     }
 
     #[test]
-    fn an_archive_holds_no_more_than_its_size_allows_and_nothing_after_its_arrays() {
+    fn npz_content_is_bounded_and_verified() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.npz");
         let array = encode(&NpyArray::u8(&[100], vec![7; 100])).unwrap();
@@ -481,7 +480,7 @@ mod tests {
             std::iter::once(&large[..]).chain(std::iter::repeat_n(&zeros[..], 100)).collect();
         let bomb = archive(&path, &parts, |_| ());
         assert!(bomb.contains("104857600 bytes") && bomb.contains("far more"), "{bomb}");
-        // A wrong sum.
+        // A wrong checksum.
         let damaged = archive(&path, &[&array], |bytes| {
             let at = bytes.windows(4).position(|w| w == b"PK\x01\x02").unwrap();
             bytes[at + 16] ^= 1;

@@ -22,21 +22,21 @@ fn write_bytes(
     colour: image::ExtendedColorType,
 ) -> Result<()> {
     use image::ImageEncoder;
-    // Through memory: the encoder keeps of an error of the disk only its text.
+    // Through memory: of an I/O error the encoder keeps only the text.
     let mut out = Vec::new();
     let encoder = image::codecs::png::PngEncoder::new(&mut out);
     encoder.write_image(bytes, size.0 as u32, size.1 as u32, colour).map_err(picture_error(path))?;
     std::fs::write(path, out).map_err(Error::unwritable(path))
 }
 
-/// 8-bit RGB PNG.
+/// Writes an 8-bit RGB PNG.
 pub fn write_png(path: &Path, image: &RgbImage) -> Result<()> {
     let bytes: Vec<u8> = image.data.iter().flat_map(|c| c.map(to_byte)).collect();
     write_bytes(path, (image.width, image.height), &bytes, image::ExtendedColorType::Rgb8)
 }
 
-/// The working image of a photo in `images` of a folder: with alpha where its background is empty,
-/// and with a grey mask in `masks`, as nerfstudio has them, where pixels are not used.
+/// Writes the working image of a photo to `images` of a folder: with alpha where its background is
+/// empty, and with a grey mask in `masks`, as in nerfstudio, where pixels are not used.
 pub(super) fn write_photo(folder: &Path, name: &str, photo: &Photo) -> Result<()> {
     let path = folder.join("images").join(name);
     match &photo.coverage {
@@ -55,27 +55,27 @@ pub(super) fn write_photo(folder: &Path, name: &str, photo: &Photo) -> Result<()
     }
 }
 
-/// 8-bit grey PNG of values in [0, 1].
+/// Writes an 8-bit grey PNG of values in [0, 1].
 pub fn write_grey_png(path: &Path, plane: &Image<f32>) -> Result<()> {
     let bytes: Vec<u8> = plane.data.iter().map(|v| to_byte(*v)).collect();
     write_bytes(path, (plane.width, plane.height), &bytes, image::ExtendedColorType::L8)
 }
 
-/// 8-bit grey PNG of given bytes.
+/// Writes an 8-bit grey PNG of given bytes.
 pub fn write_grey_bytes(path: &Path, size: (usize, usize), bytes: &[u8]) -> Result<()> {
     write_bytes(path, size, bytes, image::ExtendedColorType::L8)
 }
 
-/// 8-bit grey PNG, 0 or 255.
+/// Writes an 8-bit grey PNG, 0 or 255.
 pub fn write_mask_png(path: &Path, plane: &Image<bool>) -> Result<()> {
     let bytes: Vec<u8> = plane.data.iter().map(|v| if *v { 255 } else { 0 }).collect();
     write_bytes(path, (plane.width, plane.height), &bytes, image::ExtendedColorType::L8)
 }
 
-/// How a JPEG is written.
+/// Encoding options of a JPEG.
 #[derive(Clone, Debug)]
 pub struct Jpeg {
-    /// 1 to 100.
+    /// Quality, 1 to 100.
     pub quality: u8,
     /// A raw EXIF block.
     pub exif: Option<Vec<u8>>,
@@ -87,7 +87,7 @@ impl From<u8> for Jpeg {
     }
 }
 
-/// The bytes of a JPEG file; `jpeg` is its quality where nothing else is to be said.
+/// Bytes of a JPEG file; `jpeg` may be just its quality.
 pub fn jpeg_bytes(image: &RgbImage, jpeg: impl Into<Jpeg>) -> Result<Vec<u8>> {
     use image::ImageEncoder;
     let Jpeg { quality, exif } = jpeg.into();
@@ -104,7 +104,7 @@ pub fn jpeg_bytes(image: &RgbImage, jpeg: impl Into<Jpeg>) -> Result<Vec<u8>> {
     Ok(out)
 }
 
-/// The planes of one rendered view that go into one EXR file; all of one size.
+/// Channels of one rendered view for one EXR file; all of one size.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Planes<'a> {
     /// R, G, B.

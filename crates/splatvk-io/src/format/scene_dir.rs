@@ -1,4 +1,4 @@
-//! The scene directory: what a run writes and every other command reads.
+//! The scene directory: written by a run and read by every other command.
 use super::npy::{self, NpyArray};
 use super::{
     cameras, colmap, create_folder, gaussians, level_arrays, picture, ply, scene_photos, transforms,
@@ -15,11 +15,10 @@ use std::path::{Path, PathBuf};
 /// Version of the layout; readers refuse newer ones.
 pub const VERSION: u32 = 2;
 
-/// Name in the manifest.
+/// Format name in the manifest.
 const FORMAT: &str = "splatvk-scene";
 
-/// Text embeddings that came with precomputed features, kept so that the scene answers queries on
-/// its own.
+/// Text embeddings of precomputed features, kept so that the scene answers queries by itself.
 pub const TEXT_EMBEDDINGS: &str = "language/text_embeddings.npz";
 
 /// The manifest.
@@ -28,27 +27,27 @@ pub(super) const MANIFEST: &str = "scene.json";
 /// The Gaussians.
 pub(super) const SPLATS: &str = "point_cloud.ply";
 
-/// What the photos show of every splat, [N] f32 ([`Seen`]).
+/// Blending weight of every splat in the photos, [N] f32 ([`Seen`]).
 pub(super) const SEEN: &str = "seen.npy";
 
 /// A loaded scene.
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
 pub struct Scene {
-    /// Where it was read from.
+    /// Path of the scene.
     pub path: PathBuf,
     /// The Gaussians.
     pub splats: Splats,
-    /// What the photos show of them.
+    /// Blending weights of the splats in the photos.
     pub seen: Seen,
     /// Training cameras at working resolution; empty for a bare PLY.
     pub cameras: Vec<Camera>,
-    /// How it lies in the world, as far as that is known.
+    /// Direction up and scale, where known.
     pub world: World,
     /// Codebooks and features; `None` without language.
     pub language: Option<LanguageField>,
-    /// What was left out of a file of Gaussians, for the user; a scene directory is taken whole or
-    /// not at all.
+    /// Notes for the user on parts of a file of Gaussians that were left out; a scene directory is
+    /// read completely or refused.
     pub warnings: Vec<String>,
 }
 
@@ -84,23 +83,24 @@ struct LevelManifest {
     own_splats: bool,
 }
 
-/// Where the splats of a level with a model of its own are.
+/// File of the splats of a level with a model of its own.
 fn own_splats(language: &Path, level: &str) -> PathBuf {
     language.join(format!("splats_{level}.ply"))
 }
 
-/// What [`write()`] puts into a scene directory.
+/// Contents of a scene directory for [`write()`].
 #[derive(Clone, Copy)]
 pub struct Contents<'a> {
     /// The Gaussians.
     pub splats: &'a Splats,
-    /// What the photos show of them.
+    /// Blending weights of the splats in the photos.
     pub seen: &'a Seen,
     /// One per photo, at working resolution.
     pub cameras: &'a [Camera],
-    /// How the scene lies in the world.
+    /// Direction up and scale of the scene.
     pub world: &'a World,
-    /// Kept beside the cameras (undistorted, working resolution), for other tools; may be empty.
+    /// Photos to keep beside the cameras (undistorted, working resolution), for other tools; may be
+    /// empty.
     pub photos: &'a [Photo],
     /// Points for the COLMAP model.
     pub points: Option<&'a PointCloud>,
@@ -154,7 +154,7 @@ pub fn write(folder: &Path, c: &Contents) -> Result<()> {
     super::write_json(&folder.join(MANIFEST), &manifest)
 }
 
-/// The cameras of the photos as they were taken: at their own size, with their lens.
+/// Writes the cameras of the original photos: at their own size, with their distortion.
 fn write_originals(folder: &Path, c: &Contents) -> Result<()> {
     let cameras: Vec<Camera> =
         c.photos.iter().zip(c.cameras).map(|(photo, camera)| photo.original_camera(camera)).collect();
@@ -215,7 +215,7 @@ fn write_codebook(path: &Path, book: &Codebook, space: &str) -> Result<()> {
     )
 }
 
-/// Replaces what a scene directory states of the world.
+/// Replaces the world data of a scene directory.
 pub fn write_world(path: &Path, world: &World) -> Result<()> {
     let manifest = Manifest { world: world.clone(), ..read_manifest(path)? };
     super::write_whole_file(&path.join(MANIFEST), |file| super::write_json(file, &manifest))
@@ -246,17 +246,17 @@ pub fn load(path: &Path) -> Result<Scene> {
     Ok(Scene { path: path.into(), splats, seen, cameras, world, language, warnings: Vec::new() })
 }
 
-/// Gaussians that this program wrote: all of them or none.
+/// Reads Gaussians of this program: all of them or none.
 fn read_own(path: &Path) -> Result<Splats> {
     let splats = ply::read_splats(path)?;
     gaussians::usable::check_read(path, &splats)?;
     Ok(splats)
 }
 
-/// Scenes of earlier versions do not have the file.
+/// Reads [`SEEN`]; scenes of earlier versions lack the file.
 fn read_seen(folder: &Path, splats: usize) -> Result<Seen> {
     let file = folder.join(SEEN);
-    // A folder or a pipe in its place is not taken for "not there".
+    // A folder or a pipe in its place does not count as missing.
     if file.symlink_metadata().is_err_and(|e| e.kind() == std::io::ErrorKind::NotFound) {
         return Ok(Seen::default());
     }
@@ -278,8 +278,8 @@ fn read_seen(folder: &Path, splats: usize) -> Result<Seen> {
     }
 }
 
-/// Whether a folder is a scene directory: by the content of its manifest, as other programs use the
-/// name, too.
+/// Whether a folder is a scene directory, by the content of its manifest, as other programs use
+/// that file name, too.
 pub fn is_scene(folder: &Path) -> bool {
     read_manifest(folder).is_ok()
 }

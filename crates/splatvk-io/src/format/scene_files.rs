@@ -1,26 +1,26 @@
-//! Which files of a scene directory splatvk wrote: only they may be replaced.
+//! Files of a scene directory that splatvk wrote: only these may be replaced.
 use super::{cameras, scene_dir};
 use crate::files;
 use crate::photo::stem;
 use crate::scene::LEVEL_NAMES;
 use std::path::Path;
 
-/// What is in a scene directory and splatvk did not write, relative to it; `None` where the folder
-/// is no scene directory of this program, by its manifest.
+/// Entries of a scene directory that splatvk did not write, relative to it; `None` where the folder
+/// is no scene directory by its manifest.
 pub fn foreign(folder: &Path) -> Option<Vec<String>> {
     let names = Names::of(folder)?;
     Some(files::foreign(folder, &|name, is_folder| names.has(name, is_folder)))
 }
 
-/// Whether `file` is one that splatvk wrote into the scene directory `folder`.
+/// Whether splatvk wrote `file` into the scene directory `folder`.
 pub fn is_own(folder: &Path, file: &Path) -> bool {
     let name = file.strip_prefix(folder).ok().map(|name| name.to_string_lossy().replace('\\', "/"));
     Names::of(folder).zip(name).is_some_and(|(names, name)| names.has(&name, false))
 }
 
-/// What the names of files follow from.
+/// Data from which the names of files follow.
 struct Names {
-    /// Those of the photos.
+    /// Stems of the photos.
     stems: Vec<String>,
 }
 
@@ -29,7 +29,7 @@ impl Names {
         if !scene_dir::is_scene(folder) {
             return None;
         }
-        // A scene without cameras, or with damaged ones, has no pictures of its own.
+        // A scene without cameras, or with damaged ones, has no images of its own.
         let cameras = cameras::read(&folder.join("cameras/transforms.json")).unwrap_or_default();
         let plain = |name: &str| name.rsplit('/').next().unwrap_or_default().to_owned();
         Some(Names { stems: cameras.iter().map(|c| stem(&plain(&c.name)).to_owned()).collect() })
@@ -78,7 +78,7 @@ impl Names {
     }
 }
 
-/// Whether a file of `previews/` has the name of one that shows the view `stem`.
+/// Whether a file of `previews/` is named like a preview of the view `stem`.
 fn is_preview(file: &str, stem: &str) -> bool {
     let Some(name) = file.strip_suffix(".jpg") else { return false };
     let of_view = name.strip_prefix(stem).is_some_and(|what| {

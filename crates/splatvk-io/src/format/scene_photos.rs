@@ -1,34 +1,35 @@
-//! The photos that a scene directory keeps: their working images, and what was read of their files
-//! and taken out of them.
+//! Photos of a scene directory: their working images, the metadata of their files, and the
+//! corrections applied to them.
 use crate::photo::{self, Photo};
 use crate::scene::{Camera, Coverage, Image, Outside, RgbImage};
 use crate::{Error, Result, files};
 use std::path::{Path, PathBuf};
 
-/// Everything of the photos but their pixels, which are in `images/` beside it.
+/// All data of the photos except their pixels, which are in `images/` beside it.
 const PHOTOS: &str = "photos.json";
 
 /// Writes `photos.json` into the folder of cameras.
 pub(super) fn write(cameras: &Path, photos: &[Photo]) -> Result<()> {
-    let bare = |p: &Photo| {
-        let image = RgbImage { width: p.image.width, height: p.image.height, data: Vec::new() };
-        // Its folder is nobody's business who gets the scene.
-        let path = p.path.file_name().map_or_else(|| p.path.clone(), PathBuf::from);
-        let none = Image { width: p.image.width, height: p.image.height, data: Vec::new() };
-        let coverage = p.coverage.as_ref().map(|c| Coverage { share: none, ..c.clone() });
-        Photo { image, path, coverage, fine: None, ..p.clone() }
-    };
-    let all: Vec<Photo> = photos.iter().map(bare).collect();
+    let all: Vec<Photo> = photos.iter().map(without_pixels).collect();
     super::write_json(&cameras.join(PHOTOS), &all)
 }
 
-/// The picture of a camera of a scene directory; `None` where its name leads out of the scene.
+fn without_pixels(p: &Photo) -> Photo {
+    let image = RgbImage { width: p.image.width, height: p.image.height, data: Vec::new() };
+    // The user's folders are not disclosed with the scene.
+    let path = p.path.file_name().map_or_else(|| p.path.clone(), PathBuf::from);
+    let none = Image { width: p.image.width, height: p.image.height, data: Vec::new() };
+    let coverage = p.coverage.as_ref().map(|c| Coverage { share: none, ..c.clone() });
+    Photo { image, path, coverage, fine: None, ..p.clone() }
+}
+
+/// Image file of a camera of a scene directory; `None` where its name leads out of the scene.
 pub fn picture(scene: &Path, camera: &Camera) -> Option<PathBuf> {
     files::within(&scene.join("cameras"), &camera.name)
 }
 
-/// The photos of a scene directory as they were trained on: without lens and in one light, in the
-/// order of its cameras.
+/// Photos of a scene directory as used in training: undistorted, with photometric corrections, in
+/// the order of its cameras.
 pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     let folder = scene.join("cameras");
     let file = folder.join(PHOTOS);
@@ -42,7 +43,7 @@ pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     for photo in &mut photos {
         let path = own_file(&folder, "images", photo)?;
         check_size(&path, photo)?;
-        // Larger than any image: it is to be read as it is.
+        // Larger than any image: no scaling.
         let read = photo::load_at(&path, usize::MAX >> 16)?;
         photo.image = read.image;
         photo.coverage = match photo.coverage.as_ref().map(|c| c.outside) {
@@ -54,7 +55,7 @@ pub fn load(scene: &Path) -> Result<Vec<Photo>> {
     Ok(photos)
 }
 
-/// The PNG file of a photo in a folder of the scene's cameras.
+/// PNG file of a photo in a folder of the scene's cameras.
 fn own_file(cameras: &Path, folder: &str, photo: &Photo) -> Result<PathBuf> {
     files::within(&cameras.join(folder), &format!("{}.png", photo.stem)).ok_or_else(|| {
         Error::input(format!(
@@ -65,7 +66,8 @@ fn own_file(cameras: &Path, folder: &str, photo: &Photo) -> Result<PathBuf> {
     })
 }
 
-/// Refuses a picture of another size than its photo before it is decoded: the header may state any.
+/// Refuses an image of another size than its photo before it is decoded: its header may state any
+/// size.
 fn check_size(path: &Path, photo: &Photo) -> Result<()> {
     let (width, height) = photo::dimensions(path)?;
     if (width as usize, height as usize) == (photo.image.width, photo.image.height) {
@@ -79,7 +81,7 @@ fn check_size(path: &Path, photo: &Photo) -> Result<()> {
     )))
 }
 
-/// The share of every pixel that is used.
+/// Used share of every pixel.
 fn mask(cameras: &Path, photo: &Photo) -> Result<Image<f32>> {
     let path = own_file(cameras, "masks", photo)?;
     check_size(&path, photo)?;

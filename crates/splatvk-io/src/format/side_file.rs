@@ -1,4 +1,4 @@
-//! Language beside a file of Gaussians: `NAME.language.npz`, for formats that have no place for it.
+//! Language beside a file of Gaussians: `NAME.language.npz`, for formats without a place for it.
 //! Described in docs/use/formats.md.
 use super::level_arrays;
 use super::npy::{self, NpyArray};
@@ -9,14 +9,14 @@ use std::path::{Path, PathBuf};
 /// Version of the layout; readers refuse newer ones.
 const VERSION: u32 = 2;
 
-/// Where the language of a file is.
+/// Path of the language of a file.
 pub fn path(splats: &Path) -> PathBuf {
     let mut name = splats.as_os_str().to_os_string();
     name.push(".language.npz");
     name.into()
 }
 
-/// Writes the language of `count` Gaussians in the order of their file: its row r is number
+/// Writes the language of `count` Gaussians in the order of their file: its row r is Gaussian
 /// `order[r]` of the scene; an empty order is the scene's own.
 pub fn write(path: &Path, field: &LanguageField, count: usize, order: &[u32]) -> Result<()> {
     let mut arrays: Vec<(String, NpyArray)> = vec![
@@ -36,7 +36,7 @@ pub fn write(path: &Path, field: &LanguageField, count: usize, order: &[u32]) ->
     npy::write_packed_npz(path, &list)
 }
 
-/// Reads the language beside a file of `count` Gaussians; `None` where there is none.
+/// Reads the language beside a file of `count` Gaussians; `None` if the file does not exist.
 pub fn read(splats: &Path, count: usize) -> Result<Option<LanguageField>> {
     let file = path(splats);
     if !file.is_file() {

@@ -1,14 +1,14 @@
-//! Gaussians in other axes.
+//! Similarity transforms and mirroring of Gaussians.
 use crate::scene::sh;
 use crate::scene::{Similarity, Splats};
 use glam::{DMat3, DQuat, DVec3, Vec3};
 use nalgebra::DMatrix;
 
-/// Directions at which two expansions are compared: more than the 7 functions of degree 3 need.
+/// Directions at which two SH expansions are compared: more than the 7 functions of degree 3 need.
 const DIRECTIONS: usize = 24;
 
-/// Moves, turns and scales the Gaussians; `by.rotation` is a proper rotation, `by.scale` > 0.
-/// Colours turn with them: what a splat showed in direction d, it shows in direction R·d.
+/// Transforms the Gaussians; `by.rotation` is a proper rotation, `by.scale` > 0. SH rotate with
+/// them: the colour of direction d moves to direction R·d.
 pub fn transform_splats(splats: &mut Splats, by: &Similarity) {
     let turn = DQuat::from_mat3(&by.rotation);
     let growth = by.scale.ln() as f32;
@@ -37,8 +37,8 @@ pub fn transform_splats(splats: &mut Splats, by: &Similarity) {
     }
 }
 
-/// Mirrors the Gaussians at the plane z = 0: what a splat showed in a direction, it shows in the
-/// mirrored one.
+/// Mirrors the Gaussians at the plane z = 0: the colour of a direction moves to the mirrored
+/// direction.
 pub fn mirror_z(splats: &mut Splats) {
     splats.means.iter_mut().for_each(|m| m[2] = -m[2]);
     // A rotation about an axis becomes the opposite one about the mirrored axis.
@@ -56,20 +56,19 @@ pub fn mirror_z(splats: &mut Splats) {
     }
 }
 
-/// How the 2l + 1 coefficients of degree l change when what they describe is turned: the functions
-/// of one degree span a space that rotations do not leave, so the least squares over some
-/// directions are exact.
+/// Rotation matrix of the 2l + 1 coefficients of degree l: rotations leave the span of the
+/// functions of one degree, so that least squares over some directions are exact.
 fn turned_basis(rotation: &DMat3, degree: u32) -> DMatrix<f64> {
     let functions = 2 * degree as usize + 1;
     let first = (degree * degree) as usize;
-    let at = |turn: DMat3| {
+    let basis_values = |turn: DMat3| {
         DMatrix::from_fn(DIRECTIONS, functions, |row, column| {
             sh::basis(turn * spiral_direction(row), degree)[first + column]
         })
     };
-    let (new, old) = (at(DMat3::IDENTITY), at(rotation.transpose()));
+    let (new, old) = (basis_values(DMat3::IDENTITY), basis_values(rotation.transpose()));
     let squares = new.transpose() * &new;
-    // The directions are spread over the sphere, so the functions are far from dependent there.
+    // The directions are spread over the sphere, so the functions are well conditioned there.
     let inverse = squares.try_inverse().unwrap_or_else(|| DMatrix::identity(functions, functions));
     inverse * new.transpose() * old
 }
@@ -87,7 +86,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_turned_splat_shows_its_colours_in_turned_directions() {
+    fn transform_rotates_sh_and_covariance() {
         let sh: Vec<f32> = (0..48).map(|i| (i as f32 * 1.7).sin()).collect();
         let mut s = Splats {
             means: vec![[1.0, -2.0, 3.0]],
@@ -112,7 +111,7 @@ mod tests {
                 assert!((before - after).abs() < 1e-5, "direction {k}: {before} {after}");
             }
         }
-        // Covariance: R S Sᵀ Rᵀ turns and scales with the scene.
+        // Covariance: R S Sᵀ Rᵀ rotates and scales with the scene.
         let covariance = |q: [f32; 4], s: [f32; 3]| {
             let [w, x, y, z] = q.map(f64::from);
             let m = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
@@ -127,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mirrored_splat_shows_its_colours_in_mirrored_directions() {
+    fn mirror_z_mirrors_sh_and_covariance() {
         let sh: Vec<f32> = (0..48).map(|i| (i as f32 * 1.7).sin()).collect();
         let quat = [0.5, 0.1, -0.7, 0.3];
         let mut s = Splats {

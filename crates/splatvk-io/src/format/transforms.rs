@@ -9,9 +9,9 @@ use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::{Map, Value};
 use std::path::Path;
 
-/// Intrinsics, at the top of the file or per frame; a frame's own win. The file itself and a frame
-/// are one type: flattened structures would hold all that a file has besides in memory first.
-/// `null` is as absent.
+/// Intrinsics, at the top of the file or per frame; those of a frame take precedence. The file
+/// itself and a frame share one type: flattened structures would first hold all other keys of the
+/// file in memory. `null` counts as absent.
 #[derive(Debug, Default, Deserialize)]
 #[serde(default)]
 struct Block {
@@ -22,7 +22,7 @@ struct Block {
     // Some writers store sizes as floats.
     w: Option<f64>,
     h: Option<f64>,
-    /// Angles of view: radians, and degrees.
+    /// Angles of view, radians.
     camera_angle_x: Option<f64>,
     camera_angle_y: Option<f64>,
     x_fov: Option<f64>,
@@ -37,7 +37,7 @@ struct Block {
     k6: Option<f64>,
     p1: Option<f64>,
     p2: Option<f64>,
-    /// Other projections of instant-ngp, and how its camera moved while a picture was taken.
+    /// Other projections of instant-ngp, and camera motion during exposure.
     ftheta_p0: Option<Value>,
     latlong: Option<Value>,
     equirectangular: Option<Value>,
@@ -45,7 +45,7 @@ struct Block {
     rolling_shutter: Option<Value>,
     /// Of a frame.
     file_path: Option<String>,
-    /// Black where the photo is not to be used; beside the file.
+    /// Path relative to the file; black pixels of the mask are not used.
     mask_path: Option<String>,
     #[serde(deserialize_with = "rows")]
     transform_matrix: Option<[[f64; 4]; 3]>,
@@ -53,7 +53,7 @@ struct Block {
     frames: Option<Vec<Block>>,
 }
 
-/// The first three rows of a matrix with three or four.
+/// First three rows of a matrix with three or four.
 fn rows<'a, D: Deserializer<'a>>(from: D) -> Result<Option<[[f64; 4]; 3]>, D::Error> {
     let Some(rows) = Option::<Vec<Vec<f64>>>::deserialize(from)? else { return Ok(None) };
     let row = |k: usize| <[f64; 4]>::try_from(rows.get(k)?.as_slice()).ok();
@@ -63,7 +63,7 @@ fn rows<'a, D: Deserializer<'a>>(from: D) -> Result<Option<[[f64; 4]; 3]>, D::Er
     matrix.map(Some).ok_or_else(|| serde::de::Error::custom("transform_matrix must be 4 × 4"))
 }
 
-/// Whether a value of any type says yes.
+/// Whether a value of any type counts as set.
 fn is_set(value: Option<&Value>) -> bool {
     match value {
         None | Some(Value::Null | Value::Bool(false)) => false,
@@ -72,8 +72,8 @@ fn is_set(value: Option<&Value>) -> bool {
     }
 }
 
-/// Cameras of a file's text; `folder` is where its image paths start, for files that do not state
-/// the image size.
+/// Cameras of a file's text; image paths are relative to `folder`, for files that do not state the
+/// image size.
 pub(super) fn parse(text: &str, folder: &Path) -> Result<CameraFile, String> {
     let file: Block = files::parse_json(text.as_bytes())
         .map_err(|e| format!("not a JSON camera file (transforms.json): {e}; check it"))?;
@@ -88,7 +88,7 @@ pub(super) fn parse(text: &str, folder: &Path) -> Result<CameraFile, String> {
         moving |= is_set(both.pick(|b| b.rolling_shutter.as_ref()));
         match &frame.transform_matrix {
             Some(matrix) => cameras.push(both.camera(pose(matrix), folder)?),
-            // nerfstudio writes frames that it could not place without one.
+            // nerfstudio writes frames without a matrix where it could not register them.
             None => without.push(both.name),
         }
     }
@@ -102,7 +102,7 @@ pub(super) fn parse(text: &str, folder: &Path) -> Result<CameraFile, String> {
     Ok(CameraFile { cameras, warnings })
 }
 
-/// Frames with a mask, by the name of the photo.
+/// Mask paths of frames, by the name of the photo.
 pub(super) fn masks(text: &str) -> Result<Vec<(String, String)>, String> {
     let file: Block = files::parse_json(text.as_bytes())?;
     let named = |f: Block| Some((f.file_path?, f.mask_path.filter(|mask| !mask.is_empty())?));
@@ -113,7 +113,7 @@ fn name(frame: &Block, index: usize) -> String {
     frame.file_path.clone().filter(|p| !p.is_empty()).unwrap_or_else(|| format!("{index:05}"))
 }
 
-/// A frame with what the file states for all.
+/// A frame with the shared values of the file.
 struct Frame<'a> {
     shared: &'a Block,
     own: &'a Block,
@@ -132,12 +132,15 @@ impl<'a> Frame<'a> {
         let (w, h) = stated.or_else(|| size_of_image(folder, &self.name)).ok_or_else(|| {
             bad("no image size; add \"w\" and \"h\" to the file or keep the images beside it".to_owned())
         })?;
-        let wide = |side: f64, angle: f64| 0.5 * side / (0.5 * angle).tan();
-        let along = |side: f64, focal: Option<f64>, radians: Option<f64>, degrees: Option<f64>| {
-            focal.or_else(|| radians.or(degrees.map(f64::to_radians)).map(|angle| wide(side, angle)))
+        let focal_of_angle = |side: f64, angle: f64| 0.5 * side / (0.5 * angle).tan();
+        let focal_length = |side: f64, focal: Option<f64>, radians: Option<f64>, degrees: Option<f64>| {
+            focal
+                .or_else(|| radians.or(degrees.map(f64::to_radians)).map(|angle| focal_of_angle(side, angle)))
         };
-        let fx = along(w, self.pick(|b| b.fl_x), self.pick(|b| b.camera_angle_x), self.pick(|b| b.x_fov));
-        let fy = along(h, self.pick(|b| b.fl_y), self.pick(|b| b.camera_angle_y), self.pick(|b| b.y_fov));
+        let fx =
+            focal_length(w, self.pick(|b| b.fl_x), self.pick(|b| b.camera_angle_x), self.pick(|b| b.x_fov));
+        let fy =
+            focal_length(h, self.pick(|b| b.fl_y), self.pick(|b| b.camera_angle_y), self.pick(|b| b.y_fov));
         let fx = fx.or(fy).ok_or_else(|| bad("no focal length (fl_x or camera_angle_x)".to_owned()))?;
         let camera = Camera {
             width: w as u32,
@@ -170,22 +173,22 @@ impl<'a> Frame<'a> {
                 ));
             }
         }
-        let k = |get: fn(&Block) -> Option<f64>| self.pick(get).unwrap_or(0.0);
+        let coefficient = |get: fn(&Block) -> Option<f64>| self.pick(get).unwrap_or(0.0);
         let lens = Lens {
-            k1: k(|b| b.k1),
-            k2: k(|b| b.k2),
-            k3: k(|b| b.k3),
-            k4: k(|b| b.k4),
-            k5: k(|b| b.k5),
-            k6: k(|b| b.k6),
-            p1: k(|b| b.p1),
-            p2: k(|b| b.p2),
+            k1: coefficient(|b| b.k1),
+            k2: coefficient(|b| b.k2),
+            k3: coefficient(|b| b.k3),
+            k4: coefficient(|b| b.k4),
+            k5: coefficient(|b| b.k5),
+            k6: coefficient(|b| b.k6),
+            p1: coefficient(|b| b.p1),
+            p2: coefficient(|b| b.p2),
             fisheye: self.pick(|b| b.is_fisheye).unwrap_or(false) || model.is_some_and(LensModel::is_fisheye),
         };
         self.check(lens, model)
     }
 
-    /// Refuses coefficients that programs do not agree upon.
+    /// Refuses coefficients whose meaning differs between programs.
     fn check(&self, lens: Lens, model: Option<&LensModel>) -> Result<Lens, String> {
         if lens.fisheye && self.pick(|b| b.is_fisheye) == Some(false) {
             return Err("is_fisheye is false and camera_model a fisheye; remove one of them".to_owned());
@@ -236,7 +239,7 @@ struct OutFrame<'a> {
     transform_matrix: [[f64; 4]; 4],
 }
 
-/// The lens of a frame: its model, and the coefficients that the model has.
+/// Distortion of a frame: its model, and the coefficients of that model.
 #[derive(Serialize)]
 struct OutLens {
     camera_model: &'static str,
@@ -263,7 +266,7 @@ pub fn write(path: &Path, cameras: &[Camera], ply_file_path: Option<&str>) -> Re
     write_frames(path, cameras, None, ply_file_path)
 }
 
-/// Writes `transforms.json` of photos as they were taken: every frame with its lens.
+/// Writes `transforms.json` of the distorted photos: every frame with its distortion.
 pub fn write_lensed(path: &Path, cameras: &[Camera], lenses: &[Lens]) -> Result<()> {
     write_frames(path, cameras, Some(lenses), None)
 }

@@ -1,12 +1,12 @@
-//! A scene directory appears whole or not at all: work happens in a hidden folder beside it and is
-//! renamed in at the end.
+//! Atomic creation of a scene directory: it is written to a hidden folder beside its place and
+//! renamed at the end.
 use super::scene_files;
 use crate::files::{self, Kind, Partial, check_place, check_spared, restore, swap};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// A folder being written. Dropped without [`Workspace::commit`], it vanishes, and so do the
-/// folders that were made for it.
+/// A folder that is being written. Dropped without [`Workspace::commit`], it is removed together
+/// with the folders that were created for it.
 #[derive(Debug)]
 pub struct Workspace {
     partial: Partial,
@@ -18,30 +18,30 @@ pub struct Workspace {
 /// A kind of folder that is replaced as a whole.
 #[derive(Clone, Copy, Debug)]
 pub struct Replaced {
-    /// "a scene", for messages.
+    /// Name of the kind for messages: "a scene".
     pub name: &'static str,
-    /// What is in such a folder and splatvk did not write; `None` for every other folder.
+    /// Entries of such a folder that splatvk did not write; `None` for folders of another kind.
     pub foreign: fn(&Path) -> Option<Vec<String>>,
 }
 
 const SCENE: Replaced = Replaced { name: "a scene", foreign: scene_files::foreign };
 
 impl Workspace {
-    /// Reserves `out`: it must not exist, be an empty folder, or, with `force`, hold a scene with
-    /// nothing but what splatvk wrote, and none of the `inputs`. No other process writes there
-    /// meanwhile. Nothing at `out` changes before [`Workspace::commit`], except that a scene which
-    /// a killed process was about to replace comes back.
+    /// Reserves `out`: it must not exist, be an empty folder, or, with `force`, be a scene with
+    /// only files of splatvk and none of the `inputs`. No other process writes there meanwhile.
+    /// Nothing at `out` changes before [`Workspace::commit`], except that a scene which a killed
+    /// process had moved aside is restored.
     pub fn create(out: &Path, force: bool, inputs: &[&Path]) -> Result<Workspace> {
         Workspace::replacing(out, force, inputs, SCENE)
     }
 
-    /// [`Workspace::create`] of another kind of folder.
+    /// Like [`Workspace::create`], for another kind of folder.
     pub fn replacing(out: &Path, force: bool, inputs: &[&Path], replaced: Replaced) -> Result<Workspace> {
         if out.file_name().is_none() {
             let out = out.display();
             return Err(Error::input(format!("{out}: not a folder name; choose one such as \"scene\"")));
         }
-        // What is no folder is refused in any case.
+        // Anything but a folder is refused in any case.
         check_place(out, Kind::Folder, true)?;
         restore(out);
         if replaced.check(out, force)? {
@@ -52,14 +52,14 @@ impl Workspace {
         Ok(Workspace { partial, out: out.to_path_buf(), force, replaced })
     }
 
-    /// Where to write.
+    /// Folder to write to.
     pub fn path(&self) -> &Path {
         self.partial.path()
     }
 
-    /// Moves the folder to its place; a scene that `force` allowed to replace is removed only after
-    /// that. Where something came there meanwhile that may not be replaced, the folder goes beside
-    /// it, and the error says where.
+    /// Moves the folder to its place; a scene that `force` permits to replace is removed only after
+    /// that. Where an entry that may not be replaced came there meanwhile, the folder is moved
+    /// beside it, and the error names that place.
     pub fn commit(self) -> Result<PathBuf> {
         let Workspace { partial, out, force, replaced } = self;
         let replaces = match check_place(&out, Kind::Folder, true).and_then(|()| replaced.check(&out, force))
@@ -76,7 +76,7 @@ impl Workspace {
             let moved = if replaces {
                 swap(path, &out, &aside)
             } else {
-                // Nothing else is in it.
+                // Only leftovers are in it.
                 files::sweep(&out);
                 std::fs::rename(path, &out)
             };
@@ -87,8 +87,7 @@ impl Workspace {
 }
 
 impl Replaced {
-    /// Whether there is one at `out` that may be replaced; an error where anything is there that
-    /// may not.
+    /// Whether a folder at `out` exists and may be replaced; an error where anything else is there.
     fn check(&self, out: &Path, force: bool) -> Result<bool> {
         let (place, name) = (out.display(), self.name);
         match (self.foreign)(out) {
@@ -155,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn whole_or_not_at_all() {
+    fn workspace_commit_is_atomic() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("deep/scene");
         let w = Workspace::create(&out, false, &[]).unwrap();
@@ -179,14 +178,14 @@ mod tests {
     }
 
     #[test]
-    fn second_writer_is_refused_and_late_comers_stay() {
+    fn workspace_refuses_second_writer() {
         let folder = tempfile::tempdir().unwrap();
         let (out, beside) = (folder.path().join("scene"), folder.path().join("scene-2"));
         for force in [false, true] {
             let w = Workspace::create(&out, force, &[]).unwrap();
             refused(Workspace::create(&out, true, &[]), "another splatvk is writing there");
             write(w.path(), 10).unwrap();
-            // By another program, or by one that knows of no owner.
+            // By another program, or by one that does not use marks.
             std::fs::create_dir(&out).unwrap();
             if force {
                 std::fs::write(out.join("scene.json"), "{}").unwrap();
@@ -202,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn foreign_files_and_inputs_are_never_replaced() {
+    fn workspace_never_replaces_foreign_files() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("scene");
         let w = Workspace::create(&out, false, &[]).unwrap();
@@ -225,17 +224,17 @@ mod tests {
         refused(Workspace::create(&out, true, &[&input]), "transforms.json: is read");
         refused(Workspace::create(&out, true, &[Path::new("elsewhere"), &out]), "scene: is read");
         drop(Workspace::create(&out, true, &[folder.path()]).unwrap());
-        // Scenes of other makes, and of versions to come, are not ours.
+        // Scenes of other programs, and of future versions, are foreign.
         for manifest in ["{}", r#"{"three": true}"#, r#"{"format": "splatvk-scene", "version": 999}"#] {
             std::fs::write(out.join("scene.json"), manifest).unwrap();
             refused(Workspace::create(&out, true, &[]), "not a scene");
         }
     }
 
-    /// Opening the file gives a device on which every write says that the disk is full.
+    /// The symbolic link leads to a device on which every write fails with a full disk.
     #[cfg(target_os = "linux")]
     #[test]
-    fn a_full_disk_leaves_the_old_scene_as_it_was() {
+    fn full_disk_keeps_old_scene() {
         let folder = tempfile::tempdir().unwrap();
         let out = folder.path().join("scene");
         std::fs::create_dir(&out).unwrap();
@@ -264,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_a_scene_is_never_touched() {
+    fn workspace_refuses_other_folders() {
         let folder = tempfile::tempdir().unwrap();
         let precious = folder.path().join("photos");
         std::fs::create_dir(&precious).unwrap();

@@ -1,48 +1,55 @@
 //! Bars beside the picture that photos have in common: letterboxes, frames of instant photos, the
-//! surface of a phone around a photo, captions and banners. They stand still in the frame, so they
-//! are cut off; what is left is the photo.
+//! surface of a phone around a photo, captions and banners. They stand still in the frame and are
+//! cut off.
 //!
-//! Thin plain borders of a single photo, as of scans, are those of [`super::border`].
+//! Thin plain borders of a single photo, as of scans, are handled by [`super::border`].
 use super::border::PlainBorder;
 use super::read::{Photo, SMALLEST_SIDE};
 use crate::scene::RgbImage;
 use rayon::prelude::*;
 use std::collections::HashMap;
 
-/// Largest difference of a colour among the photos within a bar, and within a plain bar of one
-/// photo: of compression.
+/// Largest difference of a colour between the photos within a bar, and within a plain bar of one
+/// photo: compression.
 const SAME: f32 = 0.05;
-/// Share of the pixels of a line of a bar that are so.
+/// Smallest share of such pixels in a line of a bar.
 const BAR: f64 = 0.95;
-/// Share below which a line belongs to the picture: its first lines are full of the scene, where a
-/// wall or sky that looks the same in all photos ends at things of the scene, one after the other.
+/// Share below which a line belongs to the picture: where a wall or sky that looks the same in all
+/// photos ends, the share falls gradually, object by object.
 const PICTURE: f64 = 0.3;
-/// Lines, share of the shorter side, in which the bar ends: compression smears its edge over a
-/// block.
+/// Largest width of a bar's edge, share of the shorter side: compression smears it over a block.
 const EDGE: f64 = 0.02;
-/// A bar that is thinner, share of the shorter side, is an uneven border at most.
+/// Smallest bar, share of the shorter side; a thinner one is an uneven border.
 const THINNEST: f64 = 0.015;
-/// Least share of the file that the picture fills: a landscape photo on a tall phone has a quarter.
+/// Smallest share of the file that the picture fills: a landscape photo on a tall phone fills a
+/// quarter.
 const LEAST_PICTURE: f64 = 0.1;
 
-/// Bars of a photo that were cut off.
+/// Bars of a photo.
 pub(super) struct Bars {
     /// Index of the photo.
     pub(super) photo: usize,
-    /// Working pixels of the whole file.
+    /// Depths on each side, working pixels of the whole file.
     pub(super) depth: PlainBorder,
 }
 
 impl Bars {
-    /// Longer side of the picture between them, working pixels.
+    /// Longer side of the picture between the bars, working pixels.
     pub(super) fn picture_long_side(&self, photo: &Photo) -> f64 {
         let PlainBorder { left, top, right, bottom } = self.depth;
         (photo.image.width - left - right).max(photo.image.height - top - bottom) as f64
     }
+
+    /// Share of the bars in the area of the photo's image.
+    fn share(&self, image: &RgbImage) -> f64 {
+        let (w, h) = (image.width, image.height);
+        let picture = (w - self.depth.left - self.depth.right) * (h - self.depth.top - self.depth.bottom);
+        1.0 - picture as f64 / (w * h) as f64
+    }
 }
 
-/// The bars of every photo that has some: those that stand still in all photos of one size, else
-/// those of plain colour.
+/// Bars of every photo that has some: those that stand still in all photos of one size, else those
+/// of plain colour.
 pub(super) fn find(photos: &[Photo]) -> Vec<Bars> {
     let size = |p: &Photo| (p.image.width, p.image.height);
     let mut of_size: HashMap<(usize, usize), PlainBorder> = HashMap::new();
@@ -60,13 +67,13 @@ pub(super) fn find(photos: &[Photo]) -> Vec<Bars> {
     found
 }
 
-/// Bars that all photos, of one size, have in common; none of a single one. Pixels that a mask or
-/// transparency leaves out are none of theirs: they have been dealt with.
+/// Bars that all photos, of one size, have in common; none for a single photo. Pixels that a mask
+/// or transparency excludes do not count as bars.
 fn common(photos: &[&Photo]) -> PlainBorder {
     let [first, _, ..] = photos else { return PlainBorder::default() };
     let (w, h) = (first.image.width, first.image.height);
     let images: Vec<&RgbImage> = photos.iter().map(|p| &p.image).collect();
-    let same = |i: usize| {
+    let is_constant = |i: usize| {
         let alike = (0..3).all(|c| {
             let values = images.iter().map(|image| image.data[i][c]);
             let (low, high) =
@@ -75,31 +82,30 @@ fn common(photos: &[&Photo]) -> PlainBorder {
         });
         alike && photos.iter().all(|p| p.uses(i))
     };
-    let still: Vec<bool> = (0..w * h).into_par_iter().map(same).collect();
+    let still: Vec<bool> = (0..w * h).into_par_iter().map(is_constant).collect();
     let found = around((w, h), &|x, y| still[y * w + x]);
-    let ends = |depth: usize, across: usize, at: &(dyn Fn(usize, usize) -> usize + Sync)| {
+    let confirmed = |depth: usize, across: usize, at: &(dyn Fn(usize, usize) -> usize + Sync)| {
         let all = images.par_iter().all(|image| ends_at(depth, across, &|d, i| image.data[at(d, i)]));
         if all { depth } else { 0 }
     };
     let bars = PlainBorder {
-        left: ends(found.left, h, &|d, i| i * w + d),
-        top: ends(found.top, w, &|d, i| d * w + i),
-        right: ends(found.right, h, &|d, i| i * w + w - 1 - d),
-        bottom: ends(found.bottom, w, &|d, i| (h - 1 - d) * w + i),
+        left: confirmed(found.left, h, &|d, i| i * w + d),
+        top: confirmed(found.top, w, &|d, i| d * w + i),
+        right: confirmed(found.right, h, &|d, i| i * w + w - 1 - d),
+        bottom: confirmed(found.bottom, w, &|d, i| (h - 1 - d) * w + i),
     };
-    enough(bars, (w, h))
+    or_none_if_small(bars, (w, h))
 }
 
-/// Whether the line behind a bar differs from those of the bar in this photo, too: what is the same
-/// in all photos only as far as the shallowest of several skies is no bar.
+/// Whether the line after a bar differs from the lines of the bar in this photo, too: a sky equals
+/// in all photos only down to the shallowest one, and is no bar.
 fn ends_at(depth: usize, across: usize, at: &dyn Fn(usize, usize) -> [f32; 3]) -> bool {
     let alike =
         |i: &usize| at(3 * depth / 4, *i).iter().zip(at(depth, *i)).all(|(a, b)| (a - b).abs() <= SAME);
     ((0..across).filter(alike).count() as f64) < BAR * across as f64
 }
 
-/// Bars of one colour on two opposite sides of one photo. One side alone may be a sky that is burnt
-/// out.
+/// Bars of one colour on two opposite sides of one photo. One side alone may be an overexposed sky.
 fn plain(photo: &Photo) -> PlainBorder {
     let image = &photo.image;
     let (w, h) = (image.width, image.height);
@@ -110,32 +116,29 @@ fn plain(photo: &Photo) -> PlainBorder {
         let of_bar = |x: usize, y: usize| alike(x, y) && photo.uses(y * w + x);
         around((w, h), &of_bar)
     };
-    // The colour of a corner is that of its bars.
+    // The corner has the colour of its bars.
     let PlainBorder { left, top, right, bottom } = bars(0, 0);
     let both = |a: usize, b: usize| if a > 0 && b > 0 { (a, b) } else { (0, 0) };
     let ((left, right), (top, bottom)) = (both(left, right), both(top, bottom));
-    enough(PlainBorder { left, top, right, bottom }, (w, h))
+    or_none_if_small(PlainBorder { left, top, right, bottom }, (w, h))
 }
 
-/// Nothing where too little picture would be left.
-fn enough(bars: PlainBorder, (w, h): (usize, usize)) -> PlainBorder {
+/// The bars, or none where too little picture would remain.
+fn or_none_if_small(bars: PlainBorder, (w, h): (usize, usize)) -> PlainBorder {
     let (wide, high) = (w.saturating_sub(bars.left + bars.right), h.saturating_sub(bars.top + bars.bottom));
     let share = (wide * high) as f64 / (w * h) as f64;
     if wide.min(high) < SMALLEST_SIDE || share < LEAST_PICTURE { PlainBorder::default() } else { bars }
 }
 
-/// Lines on each side of a frame that are of a bar; `of_bar` says so of a pixel.
+/// Number of bar lines on each side of a frame; `of_bar` classifies a pixel.
 fn around((w, h): (usize, usize), of_bar: &dyn Fn(usize, usize) -> bool) -> PlainBorder {
     let mut bars = PlainBorder::default();
-    // A second time without the ends of the lines, which belong to the bars of the other sides.
+    // The second pass leaves out the ends of the lines, which belong to the bars of the other
+    // sides.
     for _ in 0..2 {
         let (columns, rows) = (bars.left..w - bars.right, bars.top..h - bars.bottom);
-        let share = |line: &mut dyn Iterator<Item = bool>| {
-            let (n, set) = line.fold((0usize, 0usize), |(n, set), b| (n + 1, set + usize::from(b)));
-            set as f64 / n.max(1) as f64
-        };
-        let row = |y: usize| share(&mut columns.clone().map(|x| of_bar(x, y)));
-        let column = |x: usize| share(&mut rows.clone().map(|y| of_bar(x, y)));
+        let row = |y: usize| share_of_true(columns.clone().map(|x| of_bar(x, y)));
+        let column = |x: usize| share_of_true(rows.clone().map(|y| of_bar(x, y)));
         let shorter = w.min(h) as f64;
         let found = PlainBorder {
             left: depth(w, shorter, &column),
@@ -151,13 +154,18 @@ fn around((w, h): (usize, usize), of_bar: &dyn Fn(usize, usize) -> bool) -> Plai
     bars
 }
 
-/// Lines of a bar from one side, by the share of each that is of it; 0 where it does not end at a
+fn share_of_true(line: impl Iterator<Item = bool>) -> f64 {
+    let (n, set) = line.fold((0usize, 0usize), |(n, set), b| (n + 1, set + usize::from(b)));
+    set as f64 / n.max(1) as f64
+}
+
+/// Lines of a bar from one side, by the share of bar pixels in each; 0 where it does not end at a
 /// straight edge.
 fn depth(lines: usize, shorter: f64, share: &dyn Fn(usize) -> f64) -> usize {
     let Some(end) = (0..lines).find(|d| share(*d) < BAR) else { return 0 };
     let edge = (EDGE * shorter).ceil() as usize;
     match (end..lines.min(end + edge + 1)).find(|d| share(*d) < PICTURE) {
-        // The first line of the picture has a part of the bar in it.
+        // The first line of the picture contains a part of the bar.
         Some(first) if end as f64 >= THINNEST * shorter => first + 1,
         _ => 0,
     }
@@ -165,13 +173,7 @@ fn depth(lines: usize, shorter: f64, share: &dyn Fn(usize) -> f64) -> usize {
 
 /// Warning about bars that were cut off.
 pub(super) fn message(photos: &[Photo], bars: &[Bars]) -> Option<String> {
-    let share = |b: &Bars| {
-        let image = &photos[b.photo].image;
-        let (w, h) = (image.width, image.height);
-        let picture = (w - b.depth.left - b.depth.right) * (h - b.depth.top - b.depth.bottom);
-        1.0 - picture as f64 / (w * h) as f64
-    };
-    let most = bars.iter().map(share).max_by(f64::total_cmp)?;
+    let most = bars.iter().map(|b| b.share(&photos[b.photo].image)).max_by(f64::total_cmp)?;
     let sides = |of: fn(&PlainBorder) -> usize, name: &'static str| {
         bars.iter().any(|b| of(&b.depth) > 0).then_some(name)
     };
@@ -199,7 +201,7 @@ mod tests {
 
     const SIZE: (usize, usize) = (160, 120);
 
-    /// A photo of a busy scene, another one for each seed.
+    /// A photo of a busy scene, different for each seed.
     fn photo(seed: usize, over: impl Fn(usize, usize) -> Option<[f32; 3]>) -> Photo {
         let scene = |x: usize, y: usize| {
             let wave = |k: usize| {
@@ -239,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_letterbox_of_one_photo_is_found() {
+    fn letterbox_of_one_photo_is_found() {
         let boxed = |_, y: usize| (!(26..94).contains(&y)).then_some([0.0; 3]);
         let photos = [photo(1, boxed), photo(2, |_, _| None)];
         let found = find(&photos);
@@ -248,7 +250,7 @@ mod tests {
     }
 
     #[test]
-    fn masked_bars_are_left_to_the_mask() {
+    fn masked_bars_are_ignored() {
         let boxed = |_, y: usize| (!(26..94).contains(&y)).then_some([0.0; 3]);
         let mut photos = [1, 2].map(|seed| photo(seed, boxed));
         assert_eq!(find(&photos).len(), 2);
@@ -260,8 +262,8 @@ mod tests {
     }
 
     #[test]
-    fn skies_and_plain_walls_are_no_bars() {
-        // Burnt out above roofs; a wall that objects of several heights stand before; the same
+    fn skies_and_walls_are_no_bars() {
+        // An overexposed sky above roofs; a wall behind objects of several heights; the same
         // picture twice.
         let sky = |seed: usize| photo(seed, move |x, y| (y < 40 + 10 * (x / 40) + seed).then_some([1.0; 3]));
         let wall = |seed| photo(seed, |x, y| (y < 30 + (x * 7 % 53)).then_some([0.6, 0.6, 0.5]));
@@ -273,7 +275,7 @@ mod tests {
     }
 
     #[test]
-    fn a_cut_photo_keeps_its_place_in_the_file() {
+    fn cut_photo_keeps_original_camera() {
         let mut cut = photo(1, |_, _| None);
         let bars = PlainBorder { left: 20, top: 10, right: 0, bottom: 30 };
         let hidden =
@@ -302,7 +304,7 @@ mod tests {
         assert_eq!((whole.width, whole.height, whole.cx, whole.cy), (160, 120, 90.0, 50.0));
         cut.unmirror();
         assert_eq!(cut.image.at(0, 0), photo(1, |_, _| None).image.at(159, 10));
-        // The bar on the left is one on the right of the mirrored file.
+        // The bar on the left is on the right of the mirrored file.
         assert_eq!(cut.original_camera(&camera).cx, 70.0);
         assert!(!photo(1, |_, _| None).is_cut() && photo(1, |_, _| None).off_middle() == 0.0);
     }

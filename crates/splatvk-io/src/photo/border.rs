@@ -1,10 +1,10 @@
 //! Plain borders around photos: scans, rectified and letterboxed pictures. They do not move with
-//! the scene, so they are neither matched nor trained on: their pixels continue the picture
-//! instead.
+//! the scene, so they are neither matched nor trained on: the nearest pixels of the picture replace
+//! them.
 use crate::scene::RgbImage;
 use serde::{Deserialize, Serialize};
 
-/// Lines that belong to the border on each side, pixels.
+/// Number of border lines on each side, pixels.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PlainBorder {
     /// Columns on the left.
@@ -17,19 +17,20 @@ pub struct PlainBorder {
     pub bottom: usize,
 }
 
-/// Borders are thin: plain white or black that reaches deeper is scene (sky, a studio background).
+/// Deepest border, share of the shorter side: deeper plain white or black is scene (sky, a studio
+/// background).
 const DEEPEST_SHARE: f64 = 0.08;
 /// Share of plain pixels in an outermost line of a border …
 const PLAIN: f64 = 0.9;
-/// … and below which a line belongs to the picture
-/// (bright windows may touch the border, uneven edges leave steps in it).
+/// … and share below which a line belongs to the picture (bright windows may touch the border,
+/// uneven edges leave steps in it).
 const PICTURE: f64 = 0.3;
-/// Resampling and JPEG mix the border into this many lines of the picture.
+/// Lines of the picture into which resampling and JPEG mix the border.
 const MIXED: usize = 1;
 
 impl PlainBorder {
     /// The white or black border of a picture. Opposite sides have one or neither: a bright sky has
-    /// none below.
+    /// no counterpart below.
     pub fn of(image: &RgbImage) -> PlainBorder {
         // Compression leaves a few grey levels of ringing on saturated pixels.
         let white = |c: [f32; 3]| c.iter().all(|v| *v > 0.95);
@@ -41,7 +42,7 @@ impl PlainBorder {
     fn plain(image: &RgbImage, plain: impl Fn([f32; 3]) -> bool) -> PlainBorder {
         let (w, h) = (image.width, image.height);
         let deepest = ((w.min(h) as f64 * DEEPEST_SHARE) as usize).min(w.min(h) / 4);
-        // The ends of a line belong to the border's other sides.
+        // The ends of a line belong to the other sides of the border.
         let share = |across: usize, at: &dyn Fn(usize) -> [f32; 3]| {
             let inner = deepest..across - deepest;
             inner.clone().filter(|&i| plain(at(i))).count() as f64 / inner.len().max(1) as f64
@@ -59,18 +60,18 @@ impl PlainBorder {
             top: depth(w, &|d, i| image.at(i, d)),
             bottom: depth(w, &|d, i| image.at(i, h - 1 - d)),
         };
-        let pair = |a: usize, b: usize| if a > 0 && b > 0 { (a, b) } else { (0, 0) };
+        let both_or_none = |a: usize, b: usize| if a > 0 && b > 0 { (a, b) } else { (0, 0) };
         let ((left, right), (top, bottom)) =
-            (pair(border.left, border.right), pair(border.top, border.bottom));
+            (both_or_none(border.left, border.right), both_or_none(border.top, border.bottom));
         PlainBorder { left, top, right, bottom }
     }
 
-    /// Whether there is any.
+    /// Whether there is no border.
     pub fn is_none(&self) -> bool {
         *self == PlainBorder::default()
     }
 
-    /// True on the border of a picture of this size.
+    /// Whether a pixel of a picture of this size is on the border.
     pub fn covers(&self, x: usize, y: usize, width: usize, height: usize) -> bool {
         x < self.left || y < self.top || x + self.right >= width || y + self.bottom >= height
     }
@@ -115,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn an_uneven_white_frame_is_replaced_by_its_neighbours() {
+    fn uneven_white_border_is_filled() {
         let border = |x: usize, y: usize| x < 4 + y / 60 || y < 3 || x >= 115 || y >= 98;
         let mut image = picture(|x, y| if border(x, y) { [1.0; 3] } else { scene(x, y) });
         let found = PlainBorder::of(&image);
@@ -131,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn letterbox_bars_are_frames_and_bright_scenes_are_not() {
+    fn letterbox_is_border_bright_scene_not() {
         let bars = picture(|x, y| if !(7..93).contains(&y) { [0.0; 3] } else { scene(x, y) });
         assert_eq!(PlainBorder::of(&bars), PlainBorder { top: 8, bottom: 8, ..PlainBorder::default() });
         let sky = picture(|x, y| if y < 6 { [1.0; 3] } else { scene(x, y) });

@@ -22,12 +22,12 @@ enum CandidateOrigin {
 /// A photo that has not been read yet.
 #[derive(Clone, Debug)]
 pub struct Candidate {
-    /// The file; for a frame the video's path with the frame's name behind it.
+    /// Path of the file; for a frame the path of the video, extended by the name of the frame.
     pub path: PathBuf,
     source: CandidateOrigin,
-    /// Instead of the stem of the path, where two photos have that one.
+    /// Replaces the stem of the path where two photos share it.
     stem: Option<String>,
-    /// Where it has a mask of the pixels that are used.
+    /// Path of the mask of used pixels, if any.
     pub(super) mask: Option<PathBuf>,
 }
 
@@ -37,7 +37,7 @@ impl Candidate {
         Candidate { path: path.to_path_buf(), source: CandidateOrigin::File, stem: None, mask: None }
     }
 
-    /// A photo file that goes by another name than that of the file.
+    /// A photo file with another stem than that of the file.
     pub fn named(path: &Path, stem: &str) -> Candidate {
         Candidate { stem: Some(stem.to_owned()), ..Candidate::file(path) }
     }
@@ -47,7 +47,7 @@ impl Candidate {
         self.path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
     }
 
-    /// At working resolution, see [`super::load_at`].
+    /// Reads the photo at working resolution, see [`super::load_at`].
     pub fn load(&self, max_size: usize, progress: &dyn Progress) -> Result<Photo> {
         let decoded = match &self.source {
             CandidateOrigin::File => decode::decode(read::read(&self.path)?, &self.path, None)?,
@@ -61,13 +61,13 @@ impl Candidate {
         Ok(Photo { stem, ..photo })
     }
 
-    /// Whether it is a file of its own.
+    /// Whether it is a file and not a frame.
     pub(super) fn is_file(&self) -> bool {
         matches!(self.source, CandidateOrigin::File)
     }
 
-    /// Upright pixels, at most `side` on the longer side; `None` past the end of a video that is
-    /// shorter than it says. Only one decoded file is held while it is made.
+    /// Reads the upright pixels, at most `side` on the longer side; `None` past the end of a video
+    /// that is shorter than stated. Only one decoded file is in memory at a time.
     pub fn thumbnail(&self, side: usize, progress: &dyn Progress) -> Result<Option<RgbImage>> {
         let (bytes, code) = match &self.source {
             CandidateOrigin::File => (read::read(&self.path)?, None),
@@ -80,17 +80,17 @@ impl Candidate {
         read::check_size(&self.path, decoded.size)?;
         let (w, h) = decoded.size;
         let scale = (side as f64 / w.max(h) as f64).min(1.0);
-        let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
-        // Two samples a side for every pixel of the thumbnail; all sixteen of a large photo would
-        // take as long as decoding.
+        let scaled = |n: usize| ((n as f64 * scale).round() as usize).max(1);
+        // Two samples a side for every pixel of the thumbnail; averaging all samples of a large
+        // photo would take as long as decoding.
         let step = ((0.5 / scale) as usize).max(1);
         let pixel = |x: usize, y: usize| decoded.at(x * step, y * step).0;
-        Ok(Some(resize::area_average((w / step, h / step), (to(w), to(h)), pixel)))
+        Ok(Some(resize::area_average((w / step, h / step), (scaled(w), scaled(h)), pixel)))
     }
 }
 
-/// The candidates behind files, folders and videos, in the order of their names; frames in the
-/// order of time. Warns of what folders hold besides.
+/// Candidates of files, folders and videos, in the order of their names; frames in the order of
+/// time. Warns of other files in the folders.
 pub fn gather(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Candidate>> {
     let found = find(inputs)?;
     let warnings = found.warnings();
@@ -110,7 +110,7 @@ pub fn gather(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Candida
     Ok(all)
 }
 
-/// Refuses a single photo; what was left out may be the others.
+/// Refuses a single photo; the message lists the ignored files, which may be the others.
 fn check_count(candidates: &[Candidate], left_out: &[String]) -> Result<()> {
     let [one] = candidates else { return Ok(()) };
     let besides: String = left_out.iter().map(|w| format!(" ({w})")).collect();

@@ -1,36 +1,35 @@
-//! Which files are the photos, and how many of them the run uses.
+//! Selection of photo files in folders, and their number in a run.
 use super::kind::{READ, begins_as_photo, is_foreign_name, is_photo_name, is_raw_name, is_video_name};
 use super::twins;
 use crate::error::words;
 use crate::{Error, Result, files};
 use std::path::{Component, Path, PathBuf};
 
-/// Largest number of views: the pair count grows with its square, and the method is made for a few
-/// photos.
+/// Largest number of views: the number of pairs grows with its square, and the method is made for a
+/// few photos.
 pub const MAX_VIEWS: usize = 16;
 
-/// Views used when more photos are given and `--views` is not
-/// (docs/internals/method.md#choice-of-photos).
+/// Default number of views where more photos are given (docs/internals/method.md#choice-of-photos).
 pub const DEFAULT_VIEWS: usize = 4;
 
-/// The photos behind the inputs and what was left out of the folders.
+/// Photos of the inputs, and ignored files of the folders.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct FoundFiles {
     /// Sorted by file name.
     pub photos: Vec<PathBuf>,
-    /// Videos that were named, or that are all there is in the folders.
+    /// Videos that were named, or that are the only usable files in the folders.
     pub videos: Vec<PathBuf>,
-    /// Videos beside photos and images of other kinds in the folders, which nothing reads.
+    /// Ignored files in the folders: videos beside photos, and images of unsupported formats.
     pub ignored: Vec<PathBuf>,
-    /// Files that hold the same photo as another one, which is used: (used, left out).
+    /// Files that contain the same photo as another file: (used, left out).
     pub twins: Vec<(PathBuf, PathBuf)>,
-    /// `images` folders of data sets, whose photos are taken where the folder itself has none.
+    /// `images` folders of data sets, whose photos are used where the folder itself has none.
     pub inside: Vec<PathBuf>,
 }
 
-/// Lists the photos of files and folders (not their subfolders, but for `images` of a folder
+/// Lists the photos of files and folders (without their subfolders, except `images` of a folder
 /// without photos of its own), sorted by file name, one of each where a camera wrote it in two
-/// formats. A file that is named must exist; its content is judged when it is read.
+/// formats. A named file must exist; its content is checked when it is read.
 pub fn find(inputs: &[PathBuf]) -> Result<FoundFiles> {
     let mut found = FoundFiles::default();
     for input in inputs {
@@ -61,8 +60,8 @@ pub fn find(inputs: &[PathBuf]) -> Result<FoundFiles> {
     if found.photos.is_empty() && found.videos.is_empty() { Err(nothing(inputs, &found)) } else { Ok(found) }
 }
 
-/// The photos of a folder and of those folders below it (and below its `images`) in which names of
-/// cameras lie.
+/// Finds photos in a folder and in those folders below it (and below its `images`) that the names
+/// of cameras contain.
 pub fn find_named(root: &Path, names: &[&str]) -> Result<FoundFiles> {
     let mut folders: Vec<PathBuf> = names.iter().filter_map(|name| folder_of(name)).collect();
     folders.sort();
@@ -70,15 +69,11 @@ pub fn find_named(root: &Path, names: &[&str]) -> Result<FoundFiles> {
     let below = folders.iter().flat_map(|f| [root.join(f), root.join("images").join(f)]);
     let mut all = vec![root.to_path_buf()];
     all.extend(below.filter(|folder| folder.is_dir()));
-    let has_photos = |folder: &PathBuf| {
-        let mut found = FoundFiles::default();
-        list(folder, &mut found).is_ok() && !found.photos.is_empty()
-    };
-    all.retain(has_photos);
+    all.retain(|folder| count_photos(folder).is_some());
     if all.is_empty() { find(&[root.to_path_buf()]) } else { find(&all) }
 }
 
-/// The folders of a name, relative and downwards only.
+/// Folders of a name; `None` where they are absolute or lead upwards.
 fn folder_of(name: &str) -> Option<PathBuf> {
     let name = name.replace('\\', "/");
     let folder = Path::new(&name).parent()?;
@@ -87,7 +82,7 @@ fn folder_of(name: &str) -> Option<PathBuf> {
 }
 
 impl FoundFiles {
-    /// What of the folders is not used, a line each.
+    /// Warnings about files of the folders that are not used, a line each.
     pub fn warnings(&self) -> Vec<String> {
         let show = |list: &[&PathBuf]| {
             files::listed(&list.iter().map(|p| p.display().to_string()).collect::<Vec<_>>())
@@ -126,7 +121,7 @@ impl FoundFiles {
     }
 }
 
-/// Why there is nothing.
+/// Error for inputs without photos.
 fn nothing(inputs: &[PathBuf], found: &FoundFiles) -> Error {
     let place = inputs.iter().map(|p| p.display().to_string()).collect::<Vec<_>>().join(", ");
     let below: Vec<String> = inputs
@@ -182,16 +177,18 @@ fn subfolders(folder: &Path) -> Vec<PathBuf> {
     all
 }
 
-/// Folders within two levels below one that hold photos, with their number.
+/// Folders up to two levels below one that contain photos, with their number.
 fn folders_with_photos(folder: &Path) -> Vec<(PathBuf, usize)> {
     let first = subfolders(folder);
     let all = first.iter().flat_map(|sub| [vec![sub.clone()], subfolders(sub)].concat());
-    let count = |sub: PathBuf| {
-        let mut found = FoundFiles::default();
-        list(&sub, &mut found).ok()?;
-        (!found.photos.is_empty()).then_some((sub, found.photos.len()))
-    };
-    all.filter_map(count).collect()
+    all.filter_map(|sub| count_photos(&sub).map(|count| (sub, count))).collect()
+}
+
+/// Number of photos directly in a folder; `None` without any.
+fn count_photos(folder: &Path) -> Option<usize> {
+    let mut found = FoundFiles::default();
+    list(folder, &mut found).ok()?;
+    (!found.photos.is_empty()).then_some(found.photos.len())
 }
 
 fn is_hidden(path: &Path) -> bool {
@@ -219,7 +216,7 @@ pub fn spread(count: usize, views: usize) -> Vec<usize> {
     (0..views).map(|i| if views > 1 { i * (count - 1) / (views - 1) } else { 0 }).collect()
 }
 
-/// How many of `count` photos a run uses. `views` is what the user asked for.
+/// Number of photos that a run uses, of `count`. `views` is the number that the user requested.
 pub fn photo_count(count: usize, views: Option<usize>) -> Result<usize> {
     let wanted = views.unwrap_or(count.min(DEFAULT_VIEWS));
     if wanted < 2 {
@@ -259,12 +256,12 @@ mod tests {
     }
 
     #[test]
-    fn photos_below_a_folder_are_found_or_named() {
+    fn find_searches_subfolders_of_data_sets() {
         let root = tempfile::tempdir().unwrap();
-        let at = |name: &str| root.path().join(name);
+        let path_of = |name: &str| root.path().join(name);
         let put = |name: &str| {
-            std::fs::create_dir_all(at(name).parent().unwrap()).unwrap();
-            std::fs::write(at(name), b"photo").unwrap();
+            std::fs::create_dir_all(path_of(name).parent().unwrap()).unwrap();
+            std::fs::write(path_of(name), b"photo").unwrap();
         };
         let inputs = [root.path().to_path_buf()];
         put("shoot/cam1/1.jpg");
@@ -272,36 +269,36 @@ mod tests {
         put("shoot/cam2/2.jpg");
         let e = find(&inputs).unwrap_err().to_string();
         assert!(e.contains("cam1 (1)") && e.contains("cam2 (2)") && e.contains("give one of these"), "{e}");
-        // The cameras name two of the folders below, one of which is not there.
+        // The cameras name two subfolders, one of which does not exist.
         let names = ["cam2/1.jpg", "cam9/1.jpg", "../outside/1.jpg", "/etc/1.jpg"];
-        let found = find_named(&at("shoot"), &names).unwrap();
-        assert_eq!(found.photos, [at("shoot/cam2/1.jpg"), at("shoot/cam2/2.jpg")]);
-        // A data set: copies of another size and masks lie beside the photos.
+        let found = find_named(&path_of("shoot"), &names).unwrap();
+        assert_eq!(found.photos, [path_of("shoot/cam2/1.jpg"), path_of("shoot/cam2/2.jpg")]);
+        // A data set: scaled copies and masks lie beside the photos.
         for folder in ["images", "images_2", "masks"] {
             put(&format!("{folder}/1.jpg"));
         }
         let found = find(&inputs).unwrap();
-        assert_eq!((found.photos, found.inside), (vec![at("images/1.jpg")], vec![at("images")]));
-        assert_eq!(find_named(root.path(), &["1.jpg"]).unwrap().photos, [at("images/1.jpg")]);
+        assert_eq!((found.photos, found.inside), (vec![path_of("images/1.jpg")], vec![path_of("images")]));
+        assert_eq!(find_named(root.path(), &["1.jpg"]).unwrap().photos, [path_of("images/1.jpg")]);
         put("own.jpg");
-        assert_eq!(find(&inputs).unwrap().photos, [at("own.jpg")]);
+        assert_eq!(find(&inputs).unwrap().photos, [path_of("own.jpg")]);
     }
 
     #[test]
-    fn what_looks_like_a_photo_is_named() {
+    fn find_reports_unsupported_images() {
         let root = tempfile::tempdir().unwrap();
-        let at = |name: &str| root.path().join(name);
+        let path_of = |name: &str| root.path().join(name);
         let inputs = [root.path().to_path_buf()];
-        std::fs::write(at("notes.txt"), b"words").unwrap();
-        std::fs::write(at("a.3FR"), b"raw").unwrap();
+        std::fs::write(path_of("notes.txt"), b"words").unwrap();
+        std::fs::write(path_of("a.3FR"), b"raw").unwrap();
         let e = find(&inputs).unwrap_err().to_string();
         assert!(e.contains("a.3FR: a camera raw file") && e.contains("develop it"), "{e}");
-        std::fs::write(at("b.jpg"), b"photo").unwrap();
-        std::fs::write(at("IMG_1"), b"\xff\xd8\xff\xe0\0\x10JFIF\0\x01\x01\0\0").unwrap();
+        std::fs::write(path_of("b.jpg"), b"photo").unwrap();
+        std::fs::write(path_of("IMG_1"), b"\xff\xd8\xff\xe0\0\x10JFIF\0\x01\x01\0\0").unwrap();
         let warnings = find(&inputs).unwrap().warnings();
         assert!(warnings.len() == 2 && warnings[0].contains("a.3FR; develop"), "{warnings:?}");
         assert!(warnings[1].contains("IMG_1"), "{warnings:?}");
-        // The one line of the refusal has it, too.
+        // The one-line error of a single photo contains it, too.
         let e = super::super::gather(&inputs, &crate::progress::Silent).unwrap_err().to_string();
         assert!(e.contains("only one photo") && e.contains("a.3FR"), "{e}");
     }

@@ -1,6 +1,6 @@
-//! Colours by the numbers of ITU-T H.273, as video, AVIF, HEIF and PNG state them, to sRGB.
+//! Conversion of colours to sRGB by the code points of ITU-T H.273 in video, AVIF, HEIF and PNG.
 //! Pictures of high dynamic range (PQ and HLG, ITU-R BT.2100) become linear light in which diffuse
-//! white, 203 cd/m² (ITU-R BT.2408), is 1; what is brighter stays so.
+//! white, 203 cd/m² (ITU-R BT.2408), is 1; brighter values exceed 1.
 use super::profile;
 use image::{DynamicImage, ImageBuffer, Rgb, Rgba};
 use moxcms::{CicpColorPrimaries, CicpProfile, ColorProfile, MatrixCoefficients, TransferCharacteristics};
@@ -9,12 +9,12 @@ use rayon::prelude::*;
 /// Primaries, transfer, matrix, full range.
 pub(super) type CodePoints = [u16; 4];
 
-/// How stored numbers become light.
+/// Transfer function.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Transfer {
-    /// The curve of sRGB, and that of television, which cameras and players use alike.
+    /// Curve of sRGB, also used for that of television, as cameras and players do.
     Srgb,
-    /// A power.
+    /// Power function with this exponent.
     Gamma(f32),
     Pq,
     Hlg,
@@ -46,8 +46,8 @@ impl Transfer {
         matches!(self, Transfer::Pq | Transfer::Hlg)
     }
 
-    /// Light of a signal in [0, 1], diffuse white 1. HLG is taken as the camera's light, without
-    /// the rendering for a display: photos in sRGB have none either.
+    /// Light of a signal in [0, 1]; diffuse white is 1. HLG yields scene light, without the
+    /// rendering for a display, as photos in sRGB have none either.
     fn light(self, signal: f64) -> f64 {
         match self {
             Transfer::Pq => pq_luminance(signal) / WHITE,
@@ -58,7 +58,7 @@ impl Transfer {
     }
 }
 
-/// cd/m² (SMPTE ST 2084).
+/// Luminance of a PQ signal, cd/m² (SMPTE ST 2084).
 fn pq_luminance(signal: f64) -> f64 {
     const M1: f64 = 0.159_301_757_812_5;
     const M2: f64 = 78.84375;
@@ -69,7 +69,7 @@ fn pq_luminance(signal: f64) -> f64 {
     10_000.0 * ((root - C1).max(0.0) / (C2 - C3 * root)).powf(1.0 / M1)
 }
 
-/// Scene light, 1 at full signal (ARIB STD-B67).
+/// Scene light of an HLG signal, 1 at full signal (ARIB STD-B67).
 fn hlg_light(signal: f64) -> f64 {
     const A: f64 = 0.178_832_77;
     const B: f64 = 1.0 - 4.0 * A;
@@ -77,8 +77,8 @@ fn hlg_light(signal: f64) -> f64 {
     if signal <= 0.5 { signal * signal / 3.0 } else { (((signal - C) / A).exp() + B) / 12.0 }
 }
 
-/// The image in sRGB, or in linear light with the primaries of sRGB; numbers that are not known are
-/// noted and left.
+/// Converts to sRGB, or to linear light with the primaries of sRGB for high dynamic range; unknown
+/// code points are noted and replaced by those of sRGB.
 pub(super) fn to_srgb(image: DynamicImage, code: CodePoints, notes: &mut Vec<String>) -> DynamicImage {
     let [primaries, transfer, ..] = code;
     let transfer = Transfer::of(transfer).unwrap_or_else(|| {
@@ -88,7 +88,7 @@ pub(super) fn to_srgb(image: DynamicImage, code: CodePoints, notes: &mut Vec<Str
         Transfer::Srgb
     });
     let stated = match primaries {
-        // Unspecified: BT.2100 has no other.
+        // Unspecified: BT.2100 defines no others.
         0 | 2 if transfer.is_hdr() => 9,
         0 | 2 => 1,
         p => p,
@@ -109,15 +109,14 @@ pub(super) fn to_srgb(image: DynamicImage, code: CodePoints, notes: &mut Vec<Str
     profile::by_profile(image, &profile)
 }
 
-/// The numbers that an ICC profile states beside its curves, where they are those of a high dynamic
-/// range.
+/// Code points that an ICC profile states beside its curves, if they are of high dynamic range.
 pub(super) fn of_hdr_profile(icc: &[u8]) -> Option<CodePoints> {
     let stated = ColorProfile::new_from_slice(icc).ok()?.cicp?;
     let code = [stated.color_primaries as u16, stated.transfer_characteristics as u16, 0, 1];
     is_hdr(code).then_some(code)
 }
 
-/// A profile with these primaries and the curve of sRGB.
+/// Profile with these primaries and the curve of sRGB.
 fn profile_of(primaries: u16) -> Option<ColorProfile> {
     // 10 is XYZ itself, the others are reserved.
     if !matches!(primaries, 1 | 4..=9 | 11 | 12 | 22) {
@@ -132,13 +131,13 @@ fn profile_of(primaries: u16) -> Option<ColorProfile> {
         full_range: true,
     });
     (profile.red_trc, profile.green_trc, profile.blue_trc) = (red, green, blue);
-    // A transfer of its own goes before the curves.
+    // A stated transfer would take precedence over the curves.
     profile.cicp = None;
     Some(profile)
 }
 
-/// Linear light with the primaries of sRGB, floating point; light outside of them comes to lie on
-/// their border.
+/// Converts to linear light with the primaries of sRGB, floating point; negative components are
+/// clamped to 0.
 fn linear(image: DynamicImage, transfer: Transfer, profile: &ColorProfile) -> DynamicImage {
     let table: Vec<f32> = (0..=u16::MAX).map(|v| transfer.light(f64::from(v) / 65535.0) as f32).collect();
     let m = profile.transform_matrix(&ColorProfile::new_srgb()).v.map(|row| row.map(|v| v as f32));
@@ -165,7 +164,7 @@ fn linear(image: DynamicImage, transfer: Transfer, profile: &ColorProfile) -> Dy
     made.unwrap_or_default().into()
 }
 
-/// The number of a transfer by the name that ffprobe has for it; `None` where it is not known.
+/// Number of a transfer by its name in ffprobe; `None` for unknown names.
 pub(super) fn transfer_of_name(name: &str) -> Option<u16> {
     Some(match name {
         "" | "unknown" | "unspecified" | "reserved" => 2,
@@ -186,7 +185,7 @@ pub(super) fn transfer_of_name(name: &str) -> Option<u16> {
     })
 }
 
-/// The same of primaries.
+/// Number of primaries by their name in ffprobe; `None` for unknown names.
 pub(super) fn primaries_of_name(name: &str) -> Option<u16> {
     Some(match name {
         "" | "unknown" | "unspecified" | "reserved" => 2,
@@ -204,7 +203,7 @@ pub(super) fn primaries_of_name(name: &str) -> Option<u16> {
     })
 }
 
-/// Whether 8 bits a channel are too few for it.
+/// Whether 8 bits per channel are too few for the transfer.
 pub(super) fn is_hdr(code: CodePoints) -> bool {
     Transfer::of(code[1]).is_some_and(Transfer::is_hdr)
 }
@@ -223,7 +222,7 @@ mod tests {
         assert!((hlg_light(1.0) - 1.0).abs() < 1e-6);
     }
 
-    /// A pixel of 16 bits by code points, in linear light.
+    /// Linear light of a 16-bit pixel with these code points.
     fn one(c: [f64; 3], code: CodePoints) -> [f32; 3] {
         let stored = Rgb(c.map(|v| (v * 65535.0).round() as u16));
         let image = ImageBuffer::<Rgb<u16>, _>::from_pixel(2, 2, stored);
@@ -231,6 +230,26 @@ mod tests {
         match to_srgb(image.into(), code, &mut notes) {
             DynamicImage::ImageRgb32F(i) => i.get_pixel(1, 1).0,
             other => other.to_rgb32f().get_pixel(1, 1).0.map(to_linear),
+        }
+    }
+
+    /// PQ signal of a light, by bisection.
+    fn pq(light: f64) -> f64 {
+        let (mut low, mut high) = (0.0, 1.0);
+        for _ in 0..60 {
+            let middle = 0.5 * (low + high);
+            if Transfer::Pq.light(middle) < light { low = middle } else { high = middle }
+        }
+        low
+    }
+
+    /// HLG signal of a light.
+    fn hlg(light: f64) -> f64 {
+        let e: f64 = light * hlg_light(0.75);
+        if e <= 1.0 / 12.0 {
+            (3.0 * e).sqrt()
+        } else {
+            0.17883277 * (12.0 * e - 0.28466892).ln() + 0.55991073
         }
     }
 
@@ -246,24 +265,8 @@ mod tests {
         let by = |m: [[f64; 3]; 3]| m.map(|r| (0..3).map(|k| r[k] * colour[k]).sum::<f64>());
         let in_2020 = by([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.088, 0.8956]]);
         let expected = colour.map(|v| v as f32);
-        let pq = |l: f64| {
-            let (mut low, mut high) = (0.0, 1.0);
-            for _ in 0..60 {
-                let middle = 0.5 * (low + high);
-                if Transfer::Pq.light(middle) < l { low = middle } else { high = middle }
-            }
-            low
-        };
         near(one(in_2020.map(pq), [9, 16, 9, 1]), expected);
         near(one(in_2020.map(pq), [2, 16, 9, 1]), expected);
-        let hlg = |l: f64| {
-            let e: f64 = l * hlg_light(0.75);
-            if e <= 1.0 / 12.0 {
-                (3.0 * e).sqrt()
-            } else {
-                0.17883277 * (12.0 * e - 0.28466892).ln() + 0.55991073
-            }
-        };
         near(one(in_2020.map(hlg), [9, 18, 9, 1]), expected);
         let srgb = |l: f64| f64::from(crate::scene::to_srgb(l as f32));
         near(one(in_2020.map(srgb), [9, 13, 0, 1]), expected);

@@ -1,4 +1,4 @@
-//! Bytes of an image file to upright pixels.
+//! Decoder from the bytes of an image file to upright pixels.
 use super::code_points::{self, CodePoints};
 use super::exif_tags::{Lens, lens};
 use super::heif;
@@ -22,14 +22,14 @@ mod tests;
 /// A decoded file: stored pixels, read through [`Decoded::at`] as the upright image.
 pub(super) struct Decoded {
     pixels: DynamicImage,
-    /// Of the stored pixels, by EXIF.
+    /// Orientation of the stored pixels by EXIF.
     pub orientation: Orientation,
-    /// Colours are multiplied by alpha already (OpenEXR, TIFF with associated alpha).
+    /// Whether colours are multiplied by alpha already (OpenEXR, TIFF with associated alpha).
     premultiplied: bool,
     /// Upright (width, height).
     pub size: (usize, usize),
     pub lens: Lens,
-    /// What of the file is not used, and why.
+    /// Notes on parts of the file that are not used, with the reason.
     pub notes: Vec<String>,
 }
 
@@ -40,13 +40,14 @@ impl Decoded {
         Decoded { pixels, orientation, premultiplied, size, lens, notes: Vec::new() }
     }
 
-    /// The same with the colours that the file's metadata give the stored numbers. Code points go
-    /// before a profile, a profile before the gamma and chromaticities of PNG.
+    /// Converts the stored numbers to sRGB by the metadata of the file. Code points take precedence
+    /// over a profile, a profile over the gamma and chromaticities of PNG.
     fn in_srgb(self, found: Metadata) -> Decoded {
         let Decoded { pixels, mut notes, .. } = self;
         notes.extend(found.notes);
         let pixels = match (found.code_points, found.icc, found.gamma, found.chromaticities) {
-            // Floating-point files hold linear light by convention, whatever is written beside it.
+            // Floating-point files contain linear light by convention, whatever their metadata
+            // state.
             _ if pixels.as_rgb32f().is_some() || pixels.as_rgba32f().is_some() => pixels,
             (Some(code), None, ..) => code_points::to_srgb(pixels, code, &mut notes),
             (Some(code), Some(_), ..) if code_points::is_hdr(code) || found.code_points_first => {
@@ -79,9 +80,9 @@ impl Decoded {
         }
     }
 
-    /// Upright pixel as sRGB and its alpha; the colour is not multiplied by alpha, and black where
+    /// Upright pixel in sRGB and its alpha; the colour is not multiplied by alpha, and black where
     /// alpha is 0. 1 is the white of an 8- or 16-bit file; floating-point files (OpenEXR, Radiance,
-    /// float TIFF) and those of high dynamic range go beyond it on the same curve.
+    /// float TIFF) and those of high dynamic range exceed it on the same curve.
     pub fn at(&self, x: usize, y: usize) -> ([f32; 3], f32) {
         let (c, alpha) = self.stored(x, y);
         let c = match alpha {
@@ -93,13 +94,13 @@ impl Decoded {
         (if self.is_linear() { c.map(to_srgb) } else { c }, alpha)
     }
 
-    /// Whether the file holds linear light in floating point, as all formats with floats do by
+    /// Whether the file contains linear light in floating point, as all float formats do by
     /// convention.
     fn is_linear(&self) -> bool {
         matches!(self.pixels, DynamicImage::ImageRgb32F(_) | DynamicImage::ImageRgba32F(_))
     }
 
-    /// Pixels with a value that is no finite number; only floating-point files have them.
+    /// Number of pixels with a value that is not finite; only floating-point files have them.
     pub fn not_finite(&self) -> usize {
         let count = |samples: &[f32], channels: usize| {
             samples.par_chunks(channels).filter(|p| p.iter().any(|v| !v.is_finite())).count()
@@ -120,7 +121,7 @@ impl Decoded {
     }
 }
 
-/// Where a picture of stored (width, height) has the upright pixel (x, y).
+/// Stored position of the upright pixel (x, y) in an image of stored (width, height).
 pub(super) fn stored_position(
     orientation: Orientation,
     (w, h): (usize, usize),
@@ -138,7 +139,7 @@ pub(super) fn stored_position(
     }
 }
 
-/// Whether it swaps width and height.
+/// Whether the orientation swaps width and height.
 pub(super) fn is_sideways(orientation: Orientation) -> bool {
     matches!(
         orientation,
@@ -151,8 +152,8 @@ pub(super) fn is_sideways(orientation: Orientation) -> bool {
 
 /// Colour and alpha of a stored pixel.
 fn sample(image: &DynamicImage, x: u32, y: u32) -> ([f32; 3], f32) {
-    // f32 holds every 8- and 16-bit sample; dividing keeps 255 / 255 and 65535 / 65535 at exactly
-    // 1.
+    // f32 represents every 8- and 16-bit sample; dividing keeps 255 / 255 and 65535 / 65535 at
+    // exactly 1.
     let eight = |v: u8| v as f32 / 255.0;
     let sixteen = |v: u16| v as f32 / 65535.0;
     let grey = |[v, a]: [f32; 2]| ([v; 3], a);
@@ -168,19 +169,19 @@ fn sample(image: &DynamicImage, x: u32, y: u32) -> ([f32; 3], f32) {
         DynamicImage::ImageRgba16(i) => colour(i.get_pixel(x, y).0.map(sixteen)),
         DynamicImage::ImageRgb32F(i) => (i.get_pixel(x, y).0.map(finite), 1.0),
         DynamicImage::ImageRgba32F(i) => colour(i.get_pixel(x, y).0.map(finite)),
-        // The decoders give the types above; the enum is open.
+        // The decoders return the types above; the enum is non-exhaustive.
         other => colour(image::GenericImageView::get_pixel(other, x, y).0.map(eight)),
     }
 }
 
-/// Light is not negative; renderers and sensors leave NaN, infinities and values just below zero
-/// behind.
+/// Replaces NaN, infinities and negative values by 0: renderers and sensors produce them, but light
+/// is not negative.
 fn finite(v: f32) -> f32 {
     if v.is_finite() { v.max(0.0) } else { 0.0 }
 }
 
-/// Decodes the bytes of a file; `path` only names it in messages. `code` are the code points of a
-/// frame of a video, whose file says nothing of them.
+/// Decodes the bytes of a file; `path` is only for messages. `code` is set for frames of a video:
+/// their PNG file lacks the code points.
 pub(super) fn decode(bytes: Vec<u8>, path: &Path, code: Option<CodePoints>) -> Result<Decoded> {
     let named = |what: &str| format!("{}: {what}", path.display());
     if bytes.is_empty() {
@@ -222,8 +223,7 @@ fn damaged(what: &str) -> String {
     format!("the image is damaged ({what}); copy the photo again or save it anew")
 }
 
-/// Stored pixels of an image file that holds no photo but labels: as they are, in the file's own
-/// orientation.
+/// Stored pixels of an image file of labels, without conversion, in the file's own orientation.
 pub fn stored_pixels(path: &Path) -> Result<DynamicImage> {
     let bytes = files::read(path)?;
     let named = |what: &str| Error::input(format!("{}: {what}", path.display()));
@@ -234,8 +234,8 @@ pub fn stored_pixels(path: &Path) -> Result<DynamicImage> {
     read.unwrap_or_else(|panic| Err(damaged(&panic))).map_err(|what| named(&what))
 }
 
-/// A file that the `image` crate reads and what it says beside its pixels; the error is one line
-/// without the file's name.
+/// Decodes a file that the `image` crate supports, with its metadata; the error is one line without
+/// the file's name.
 fn coded(mut bytes: Vec<u8>, format: ImageFormat) -> Result<(Decoded, Metadata), String> {
     let mut notes = Vec::new();
     match format {
@@ -249,7 +249,7 @@ fn coded(mut bytes: Vec<u8>, format: ImageFormat) -> Result<(Decoded, Metadata),
         _ => {}
     }
     let mut premultiplied = format == ImageFormat::OpenExr;
-    // Taken from PNG and TIFF files before their decoders, which have no bound for them.
+    // Extracted from PNG and TIFF files before decoding, as their decoders do not bound it.
     let beside = match format {
         ImageFormat::Png => Some(png::take_metadata(&mut bytes)),
         ImageFormat::Tiff => Some(tiff_metadata(&bytes, &mut premultiplied)),
@@ -273,12 +273,12 @@ fn coded(mut bytes: Vec<u8>, format: ImageFormat) -> Result<(Decoded, Metadata),
     found.adobe_rgb |= found.exif.as_deref().and_then(Directories::of).is_some_and(|d| d.is_adobe_rgb());
     let orientation = match &found.exif {
         Some(raw) => Orientation::from_exif_chunk(raw),
-        // BigTIFF has no block for EXIF readers; its decoder knows the orientation.
+        // BigTIFF has no block for EXIF readers; its decoder returns the orientation.
         None if format == ImageFormat::Tiff => decoder.orientation().ok(),
         None => None,
     };
     let orientation = orientation.unwrap_or(Orientation::NoTransforms);
-    // Checked here too: not every decoder heeds the limit before it allocates.
+    // Checked here, too: not every decoder checks the limit before it allocates.
     if decoder.total_bytes() > LARGEST_DECODED {
         return Err(TOO_LARGE.to_owned());
     }
@@ -287,8 +287,8 @@ fn coded(mut bytes: Vec<u8>, format: ImageFormat) -> Result<(Decoded, Metadata),
     Ok((Decoded::new(pixels, orientation, premultiplied, lens), found.bounded()))
 }
 
-/// The tags of the first image of a TIFF file, which is an EXIF block with pixels; none where they
-/// are damaged, and none of BigTIFF.
+/// Metadata of the first image of a TIFF file, whose tags form an EXIF block; empty where they are
+/// damaged, and for BigTIFF.
 fn tiff_metadata(bytes: &[u8], premultiplied: &mut bool) -> Metadata {
     let Some(tags) = Directories::of(bytes) else { return Metadata::default() };
     *premultiplied = tags.has_associated_alpha();
@@ -305,8 +305,8 @@ fn tiff_metadata(bytes: &[u8], premultiplied: &mut bool) -> Metadata {
     }
 }
 
-/// Longest header of a Radiance file, bytes: its lines hold the commands that made it. The decoder
-/// keeps each with 43 times its size.
+/// Longest header of a Radiance file, bytes: its lines record the commands that made it. The
+/// decoder keeps each with 43 times its size.
 pub(super) const LONGEST_RADIANCE: usize = 64 << 10;
 
 fn check_radiance(bytes: &[u8]) -> Result<(), String> {

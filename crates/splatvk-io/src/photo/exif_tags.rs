@@ -1,46 +1,46 @@
-//! Camera and lens in EXIF data.
+//! Camera and lens data from EXIF.
 use super::tiff::Directories;
 use exif::{Field, In, Reader, Tag, Value};
 use glam::DVec3;
 
-/// Diagonal of the 36 × 24 mm frame that "35 mm equivalent" refers to (CIPA DCG-001: equal diagonal
-/// angle of view).
+/// Diagonal of the 36 × 24 mm frame of the "35 mm equivalent" (CIPA DCG-001: equal diagonal angle
+/// of view), mm.
 const FULL_FRAME_DIAGONAL_MM: f64 = 43.266615305567875;
 
-/// Shortest and longest plausible focal length over the long side of the image: a 140° fisheye and
-/// a 1,000 mm telephoto lens on full frame. Tags outside are typing errors or placeholders.
+/// Plausible focal lengths, relative to the long side of the image: from a 140° fisheye to a 1,000
+/// mm telephoto lens on full frame. Tags outside are typing errors or placeholders.
 const PLAUSIBLE_FOCAL: std::ops::Range<f64> = 0.18..28.0;
 
-/// Lens facts of one file.
+/// Camera and lens data of one file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Lens {
-    /// Focal length in pixels of the upright original, from the tags that state it.
+    /// Focal length in pixels of the upright original, if a tag states it.
     pub focal: Option<f64>,
     /// "Make Model".
     pub camera_model: Option<String>,
-    /// Name of the lens, if it states that it is a fisheye.
+    /// Name of the lens, if the name states a fisheye.
     pub fisheye: Option<String>,
     /// Unit vector of gravity in camera axes of the upright photo, as the phone measured it.
     pub gravity: Option<DVec3>,
-    /// What says that the picture is a stitched panorama.
+    /// Evidence that the picture is a stitched panorama.
     pub panorama: Option<String>,
 }
 
-/// Reads the lens facts out of a raw EXIF block; a damaged block yields what could be read. `size`
-/// is the size of the image in pixels, in either orientation.
+/// Reads camera and lens data from a raw EXIF block; a damaged block yields the readable part.
+/// `size` is the size of the image in pixels, in either orientation.
 pub(super) fn lens(raw: &[u8], size: (u32, u32)) -> Lens {
     let Some(tags) = Directories::of(raw) else { return Lens::default() };
     let read = Reader::new().continue_on_error(true).read_raw(tags.digest());
     match read.or_else(|e| e.distill_partial_result(|_| ())) {
-        Ok(exif) => of(&|tag| exif.get_field(tag, In::PRIMARY), size),
+        Ok(exif) => lens_of(&|tag| exif.get_field(tag, In::PRIMARY), size),
         Err(_) => Lens::default(),
     }
 }
 
-/// The first field of a tag that describes the primary image.
+/// Look-up of the first field of a tag that describes the primary image.
 type Fields<'a> = &'a dyn Fn(Tag) -> Option<&'a Field>;
 
-fn of(fields: Fields, size: (u32, u32)) -> Lens {
+fn lens_of(fields: Fields, size: (u32, u32)) -> Lens {
     Lens {
         focal: focal(fields, size),
         camera_model: camera_model(fields),
@@ -59,9 +59,9 @@ fn number(fields: Fields, tag: Tag) -> Option<f64> {
     (value.is_finite() && value > 0.0).then_some(value)
 }
 
-/// The focal plane tags are exact where they are right, the 35 mm tag is a whole number of
-/// millimetres (2 % at 26 mm) but hard to get wrong: the former count only when the latter agrees
-/// or is absent.
+/// Focal length in pixels. The focal plane tags are exact where they are right; the 35 mm tag is a
+/// whole number of millimetres (2 % at 26 mm) but rarely wrong. The former count only if the latter
+/// agrees or is absent.
 fn focal(fields: Fields, (w, h): (u32, u32)) -> Option<f64> {
     let (w, h) = (w as f64, h as f64);
     if is_cut(fields, w.max(h) / w.min(h)) {
@@ -73,16 +73,15 @@ fn focal(fields: Fields, (w, h): (u32, u32)) -> Option<f64> {
         .filter(plausible);
     let plane = focal_plane(fields, w.max(h)).filter(plausible);
     match (plane, equivalent) {
-        // 12 %: rounding of a short 35 mm figure plus the width-based equivalents that some makers
-        // write.
+        // 12 %: rounding of a short 35 mm figure plus the width-based equivalents of some makers.
         (Some(p), Some(e)) if (p / e).ln().abs() < 0.12 => Some(p),
         (_, Some(e)) => Some(e),
         (p, None) => p,
     }
 }
 
-/// Whether the file has another shape than the camera wrote: cut out since, and scaled by what no
-/// tag states.
+/// Whether the file has another aspect than the camera wrote: it was cropped since, at an unknown
+/// scale.
 fn is_cut(fields: Fields, aspect: f64) -> bool {
     let side = |tag| number(fields, tag);
     let written = side(Tag::PixelXDimension).zip(side(Tag::PixelYDimension));
@@ -101,15 +100,16 @@ fn focal_plane(fields: Fields, long_side: f64) -> Option<f64> {
         5 => 0.001,
         _ => return None,
     };
-    // The resolution counts pixels of the image as the camera wrote it; PixelXDimension tells when
-    // it was scaled since.
+    // The resolution counts pixels of the image as the camera wrote it; PixelXDimension states its
+    // size before later scaling.
     let written = [Tag::PixelXDimension, Tag::PixelYDimension].map(|t| number(fields, t).unwrap_or(0.0));
     let written = written[0].max(written[1]);
     let scale = if written > 0.0 { long_side / written } else { 1.0 };
     Some(mm * resolution / unit_mm * scale)
 }
 
-/// Makers call the lens so; a wide lens that is none (GoPro's "linear", phones' 0.5×) does not.
+/// Name of a fisheye lens: makers use this word, and not for other wide lenses (GoPro's "linear",
+/// phones' 0.5×).
 fn fisheye(fields: Fields) -> Option<String> {
     let name = ascii(fields, Tag::LensModel)?;
     let plain = name.to_lowercase().replace(['-', ' '], "");
@@ -123,12 +123,12 @@ fn panorama(fields: Fields) -> Option<String> {
     (by_apple && processing == Some(6)).then(|| "EXIF CustomRendered=6".to_owned())
 }
 
-/// A phone that is held still measures 1 g; what a moving one measures is not gravity alone.
+/// Accelerations of a phone that is held still, g; a moving phone does not measure gravity alone.
 const STILL: std::ops::Range<f64> = 0.93..1.07;
 
-/// From the acceleration that iPhones note: in g, in axes of the phone (right, towards its top, out
-/// of its screen). The stored pictures of its back camera lie on their side: x towards the phone's
-/// bottom, y towards its left.
+/// Gravity from the acceleration that iPhones record: in g, in axes of the phone (right, towards
+/// its top, out of its screen). The stored pictures of its back camera lie on their side: x towards
+/// the phone's bottom, y towards its left.
 fn gravity(fields: Fields) -> Option<DVec3> {
     let Value::Undefined(note, _) = &fields(Tag::MakerNote)?.value else { return None };
     if ascii(fields, Tag::LensModel).is_some_and(|lens| lens.to_lowercase().contains("front")) {
@@ -141,16 +141,15 @@ fn gravity(fields: Fields) -> Option<DVec3> {
         3 => Some(DVec3::new(-stored.x, -stored.y, stored.z)),
         6 => Some(DVec3::new(-stored.y, stored.x, stored.z)),
         8 => Some(DVec3::new(stored.y, -stored.x, stored.z)),
-        // Mirrored: not as a camera wrote it.
+        // Mirrored: not written by a camera.
         _ => None,
     }
 }
 
-/// Tag 8 of Apple's maker note, three signed fractions; `None` where the note is another maker's or
-/// damaged.
+/// Tag 8 of Apple's maker note, three signed fractions; `None` for a note of another maker or a
+/// damaged one.
 fn apple_acceleration(note: &[u8]) -> Option<DVec3> {
-    // After the name, a version and "MM" follows a TIFF directory whose offsets count from the
-    // name.
+    // A TIFF directory follows the name, a version and "MM"; its offsets count from the name.
     note.strip_prefix(b"Apple iOS\0").filter(|rest| rest.get(2..4) == Some(b"MM"))?;
     let bytes = |at: usize| note.get(at..at.checked_add(4)?)?.try_into().ok();
     let short = |at: usize| Some(u16::from_be_bytes(note.get(at..at.checked_add(2)?)?.try_into().ok()?));
@@ -223,8 +222,8 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn parts_of_photos_state_no_focal_length() {
-        let of = |written: [u32; 2], size| {
+    fn cropped_photo_has_no_focal_length() {
+        let focal_of = |written: [u32; 2], size| {
             let fields = [
                 (Tag::FocalLengthIn35mmFilm, Value::Short(vec![26])),
                 (Tag::PixelXDimension, Value::Long(vec![written[0]])),
@@ -232,12 +231,12 @@ pub(super) mod tests {
             ];
             lens(&block(&fields), size).focal
         };
-        assert!(of([4000, 3000], (800, 600)).is_some() && of([4000, 3000], (600, 800)).is_some());
-        assert!(of([4000, 3000], (1500, 1500)).is_none());
+        assert!(focal_of([4000, 3000], (800, 600)).is_some() && focal_of([4000, 3000], (600, 800)).is_some());
+        assert!(focal_of([4000, 3000], (1500, 1500)).is_none());
     }
 
     #[test]
-    fn focal_plane_tags_count_when_they_agree() {
+    fn focal_plane_tags_need_agreement() {
         // 50 mm on a 36 mm wide sensor of 6000 pixels: 8333 px; the file was halved since.
         let mut fields = vec![
             (Tag::FocalLength, rational(50, 1)),
@@ -261,7 +260,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn a_fisheye_is_told_by_its_name() {
+    fn fisheye_is_detected_by_lens_name() {
         let named = |name: &str| {
             lens(&block(&[(Tag::LensModel, Value::Ascii(vec![name.into()]))]), (4000, 3000)).fisheye
         };
@@ -290,8 +289,8 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn gravity_is_that_of_the_upright_photo() {
-        let of = |acceleration, orientation| {
+    fn gravity_is_in_upright_axes() {
+        let gravity_of = |acceleration, orientation| {
             let fields = [
                 (Tag::MakerNote, Value::Undefined(note(acceleration), 0)),
                 (Tag::Orientation, Value::Short(vec![orientation])),
@@ -303,25 +302,25 @@ pub(super) mod tests {
             assert!((found - DVec3::new(x, y, z)).length() < 1e-9, "{found}");
         };
         // Upright, on its left and on its right side, upside down: always down in the photo.
-        near(of([0, -1000, 0], 6), 0.0, 1.0, 0.0);
-        near(of([-1000, 0, 0], 1), 0.0, 1.0, 0.0);
-        near(of([1000, 0, 0], 3), 0.0, 1.0, 0.0);
-        near(of([0, 1000, 0], 8), 0.0, 1.0, 0.0);
+        near(gravity_of([0, -1000, 0], 6), 0.0, 1.0, 0.0);
+        near(gravity_of([-1000, 0, 0], 1), 0.0, 1.0, 0.0);
+        near(gravity_of([1000, 0, 0], 3), 0.0, 1.0, 0.0);
+        near(gravity_of([0, 1000, 0], 8), 0.0, 1.0, 0.0);
         // Upright and leaning forward, so that the camera looks down: partly ahead.
-        near(of([0, -800, -600], 6), 0.0, 0.8, 0.6);
+        near(gravity_of([0, -800, -600], 6), 0.0, 0.8, 0.6);
         // Rolled to the right: its right side is lower.
-        near(of([600, -800, 0], 6), 0.6, 0.8, 0.0);
-        assert_eq!(of([0, -1500, 0], 6), None, "shaken");
-        assert_eq!(of([0, -1000, 0], 2), None, "mirrored");
-        let by = |lens_model: &str| {
+        near(gravity_of([600, -800, 0], 6), 0.6, 0.8, 0.0);
+        assert_eq!(gravity_of([0, -1500, 0], 6), None, "shaken");
+        assert_eq!(gravity_of([0, -1000, 0], 2), None, "mirrored");
+        let gravity_with_lens = |lens_model: &str| {
             let fields = [
                 (Tag::MakerNote, Value::Undefined(note([0, -1000, 0]), 0)),
                 (Tag::LensModel, Value::Ascii(vec![lens_model.into()])),
             ];
             lens(&block(&fields), (4000, 3000)).gravity
         };
-        assert!(by("iPhone 15 back camera 5.96mm f/1.6").is_some());
-        assert_eq!(by("iPhone 15 front camera 2.69mm f/1.9"), None, "it looks the other way");
+        assert!(gravity_with_lens("iPhone 15 back camera 5.96mm f/1.6").is_some());
+        assert_eq!(gravity_with_lens("iPhone 15 front camera 2.69mm f/1.9"), None, "it looks the other way");
         for cut in 0..68 {
             assert_eq!(apple_acceleration(&note([0, -1000, 0])[..cut]), None);
         }
@@ -331,7 +330,7 @@ pub(super) mod tests {
     #[test]
     fn nonsense_is_ignored() {
         assert_eq!(lens(b"Exif?", (100, 100)), Lens::default());
-        // No focal length, and such as no lens of a camera has.
+        // Missing focal lengths, and implausible ones.
         for mm in [0, 1, 65_535] {
             let fields = [(Tag::FocalLengthIn35mmFilm, Value::Short(vec![mm]))];
             assert_eq!(lens(&block(&fields), (100, 100)).focal, None, "{mm} mm");

@@ -1,4 +1,4 @@
-//! Sizes of image files by their headers.
+//! Sizes of image files, from their headers.
 use super::heif;
 use super::turn::Turn;
 use crate::files::{self, guarded};
@@ -8,7 +8,7 @@ use image::{ImageDecoder, ImageFormat, ImageReader, Limits};
 use std::io::{BufReader, Cursor, Read};
 use std::path::Path;
 
-/// Stored (width, height) of an image file, by its header; orientation is not applied.
+/// Stored (width, height) of an image file, from its header; orientation is not applied.
 pub fn dimensions(path: &Path) -> Result<(u32, u32)> {
     let read = guarded(|| header(path).map(|decoder| decoder.dimensions()));
     let bad = |what: String| Error::input(format!("{}: cannot be read as an image: {what}", path.display()));
@@ -25,7 +25,7 @@ enum HeaderError {
     Image(image::ImageError),
 }
 
-/// Most memory that the header of a file may take: its profile is inflated with it.
+/// Largest memory for the header of a file, bytes: it includes the inflated profile.
 const LARGEST_HEADER: u64 = 16 << 20;
 
 /// A decoder that has read the header.
@@ -38,7 +38,7 @@ fn header(path: &Path) -> Result<Box<dyn ImageDecoder>, HeaderError> {
     limits.max_alloc = Some(LARGEST_HEADER);
     reader.limits(limits);
     if reader.format() == Some(ImageFormat::Hdr) {
-        // Its decoder keeps every line of a header without a bound.
+        // Its decoder stores every line of a header without a bound.
         let start = Cursor::new(first_bytes(path).map_err(HeaderError::File)?);
         let decoder = ImageReader::with_format(start, ImageFormat::Hdr).into_decoder();
         return decoder.map(|d| Box::new(d) as _).map_err(HeaderError::Image);
@@ -46,7 +46,7 @@ fn header(path: &Path) -> Result<Box<dyn ImageDecoder>, HeaderError> {
     reader.into_decoder().map(|d| Box::new(d) as _).map_err(HeaderError::Image)
 }
 
-/// As many bytes as the header of a Radiance file may have.
+/// First bytes of a file, up to the longest header of a Radiance file.
 fn first_bytes(path: &Path) -> Result<Vec<u8>> {
     let mut bytes = Vec::new();
     let most = super::decode::LONGEST_RADIANCE as u64;
@@ -54,7 +54,7 @@ fn first_bytes(path: &Path) -> Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// Pixels of an image file of any kind, by its header; 0 where it cannot be read.
+/// Number of pixels of an image file of any kind, from its header; 0 where it cannot be read.
 pub(super) fn pixels(path: &Path) -> u64 {
     match upright_size(path) {
         Some((w, h)) => (w * h) as u64,
@@ -62,13 +62,13 @@ pub(super) fn pixels(path: &Path) -> u64 {
     }
 }
 
-/// Upright (width, height) of an image file that the `image` crate reads.
+/// Upright (width, height) of an image file that the `image` crate supports.
 pub(super) fn upright_size(path: &Path) -> Option<(usize, usize)> {
     let read = || {
         let mut decoder = header(path).ok()?;
         let (w, h) = decoder.dimensions();
         let turn = Turn::from(decoder.orientation().unwrap_or(Orientation::NoTransforms));
-        // Turning is its own inverse but for the direction.
+        // The swap of width and height is its own inverse.
         let (w, h) = turn.stored((w, h));
         Some((w as usize, h as usize))
     };

@@ -18,13 +18,13 @@ const LIBRARIES: &[&str] = &["heif.dll", "libheif.dll"];
 #[cfg(not(any(target_os = "macos", windows)))]
 const LIBRARIES: &[&str] = &["libheif.so.1"];
 
-/// A library elsewhere, instead of the system's.
+/// Environment variable with the path of another library than the system's.
 const VARIABLE: &str = "SPLATVK_LIBHEIF";
 
-/// What to do without the library.
+/// Advice where the library is missing.
 const INSTALL: &str = "install it (tools/setup; apt-get install libheif1; brew install libheif)";
 
-/// What to do without one of its decoders, which newer systems keep in packages of their own.
+/// Advice where a decoder is missing; newer systems have separate packages for them.
 const INSTALL_DECODER: &str = "install it (tools/setup; apt-get install libheif-plugin-libde265 for HEVC, \
     libheif-plugin-dav1d for AV1)";
 
@@ -36,7 +36,7 @@ struct Status {
     message: *const c_char,
 }
 
-/// The beginning of `struct heif_color_profile_nclx`, all versions of it.
+/// Beginning of `struct heif_color_profile_nclx`, the same in all versions.
 #[repr(C)]
 struct Nclx {
     version: u8,
@@ -62,14 +62,13 @@ const CHANNEL_INTERLEAVED: c_int = 10;
 /// Opaque `heif_context`, `heif_image_handle` and `heif_image`.
 type Pointer = *mut c_void;
 
-/// The functions used, one line each: the struct, its fields and their look-up follow from this
-/// table.
+/// Defines the struct, its fields and their look-up from a table of the used functions.
 macro_rules! functions {
     ($($name:ident: fn($($argument:ty),*) $(-> $result:ty)?;)*) => {
         #[allow(non_snake_case)] // the library's spelling
         struct Api {
             $($name: unsafe extern "C" fn($($argument),*) $(-> $result)?,)*
-            /// Keeps the functions' code in memory.
+            /// Keeps the code of the functions in memory.
             _library: Library,
         }
 
@@ -78,7 +77,7 @@ macro_rules! functions {
             /// The library must be libheif, whose symbols have the signatures above.
             unsafe fn of(library: Library) -> Result<Api, libloading::Error> {
                 Ok(Api {
-                    // SAFETY: the caller's promise.
+                    // SAFETY: guaranteed by the caller.
                     $($name: unsafe { *library.get(stringify!($name))? },)*
                     _library: library,
                 })
@@ -140,7 +139,7 @@ fn load() -> Result<Api, String> {
     Ok(api)
 }
 
-/// "libheif 1.15.1 · HEVC, AV1", or what is missing and what to do: `(found, advice)`.
+/// Support for HEIC and AVIF: "libheif 1.15.1 · HEVC, AV1", or the missing part with advice.
 pub(super) fn status() -> Support {
     let api = match api() {
         Ok(api) => api,
@@ -160,26 +159,26 @@ pub(super) fn status() -> Support {
     Support { found: format!("libheif {version} · {found}"), advice }
 }
 
-/// The primary image of a file, upright: libheif applies the rotation and mirroring that the
-/// container states, and those count, not the orientation in EXIF (ISO/IEC 23008-12).
+/// Upright primary image of a file: libheif applies the rotation and mirroring of the container,
+/// which take precedence over the orientation in EXIF (ISO/IEC 23008-12).
 pub(super) struct Image {
     pub pixels: DynamicImage,
     pub metadata: Metadata,
 }
 
-/// Why there is no image: something to install, or something about the file. One line without the
-/// file's name.
+/// Failure to read an image: a missing part to install, or a fault of the file. One line without
+/// the file's name.
 pub(super) enum Failure {
     Missing(String),
     Input(String),
 }
 
-/// Decodes the primary image. 8-bit files give 8-bit, others 16-bit samples; premultiplied colours
-/// stay so and lose their alpha, which is the same as compositing on black.
+/// Decodes the primary image. 8-bit files yield 8-bit, others 16-bit samples; premultiplied colours
+/// lose their alpha, which equals compositing on black.
 pub(super) fn decode(bytes: &[u8]) -> Result<Image, Failure> {
     let api = api().map_err(|what| Failure::Missing(format!("is a HEIC/AVIF photo and {what}")))?;
-    // SAFETY: `bytes` outlives the context, every pointer is freed once, and after what was made
-    // from it.
+    // SAFETY: `bytes` outlives the context, and every pointer is freed once, after the values that
+    // were made from it.
     unsafe {
         let (_context, handle) = primary(api, bytes)?;
         let shape = HeifLayout::of(api, handle.pointer)?;
@@ -198,7 +197,7 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Image, Failure> {
     }
 }
 
-/// Pixels of the primary image, without decoding it; 0 where it cannot be read.
+/// Number of pixels of the primary image, without decoding it; 0 where it cannot be read.
 pub(super) fn pixels(bytes: &[u8]) -> u64 {
     let Ok(api) = api() else { return 0 };
     let side = |n: c_int| u64::try_from(n).unwrap_or(0);
@@ -218,7 +217,7 @@ pub(super) fn pixels(bytes: &[u8]) -> u64 {
 /// `bytes` must outlive the context.
 unsafe fn primary(api: &Api, bytes: &[u8]) -> Result<(Owned, Owned), Failure> {
     let owned = |pointer, free| Owned { pointer, free };
-    // SAFETY: pointers that the library has made, each freed once.
+    // SAFETY: pointers from the library, each freed once.
     unsafe {
         let context = owned((api.heif_context_alloc)(), api.heif_context_free);
         if context.pointer.is_null() {
@@ -232,7 +231,7 @@ unsafe fn primary(api: &Api, bytes: &[u8]) -> Result<(Owned, Owned), Failure> {
     }
 }
 
-/// A pointer of the library with its destructor.
+/// A pointer from the library with its destructor.
 struct Owned {
     pointer: Pointer,
     free: unsafe extern "C" fn(Pointer),
@@ -240,7 +239,7 @@ struct Owned {
 
 impl Drop for Owned {
     fn drop(&mut self) {
-        // SAFETY: made by the library, not freed before.
+        // SAFETY: created by the library, not freed before.
         unsafe { (self.free)(self.pointer) }
     }
 }
@@ -249,7 +248,7 @@ fn check(api: &Api, status: Status) -> Result<(), Failure> {
     if status.code == 0 {
         return Ok(());
     }
-    // SAFETY: the header promises a string with every error.
+    // SAFETY: the header guarantees a string with every error.
     let text = unsafe { CStr::from_ptr(status.message) }.to_string_lossy();
     let text = text.split_whitespace().collect::<Vec<_>>().join(" ");
     Err(match status.code {
@@ -270,7 +269,7 @@ fn check(api: &Api, status: Status) -> Result<(), Failure> {
     })
 }
 
-/// Layout of the samples that libheif is to return.
+/// Layout of the samples to request from libheif.
 struct HeifLayout {
     deep: bool,
     alpha: bool,
@@ -352,7 +351,8 @@ impl HeifLayout {
     }
 }
 
-/// Bytes of a block of metadata. In JPEG they have 64 KiB at most; more than this is damage.
+/// Largest block of metadata, bytes. In JPEG it has 64 KiB at most; a larger one than this is
+/// damage.
 const LARGEST_BLOCK: usize = 16 << 20;
 
 unsafe fn icc(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
@@ -368,7 +368,7 @@ unsafe fn icc(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
     }
 }
 
-/// The numbers of ITU-T H.273 in the container or the stream.
+/// Code points of ITU-T H.273 in the container or the stream.
 unsafe fn code_points(api: &Api, handle: Pointer) -> Option<[u16; 4]> {
     let mut found = ptr::null_mut();
     // SAFETY: the caller's valid handle; the structure is read before it is freed.
@@ -384,11 +384,11 @@ unsafe fn code_points(api: &Api, handle: Pointer) -> Option<[u16; 4]> {
     }
 }
 
-/// The XMP packet: a block of the type that MIME has for RDF.
+/// The XMP packet: a block with the MIME type of RDF.
 unsafe fn xmp(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
     let mut ids = [0u32; 8];
-    // SAFETY: the caller's valid handle; at most as many ids as there is room for; the type is a
-    // string of the library or null.
+    // SAFETY: the caller's valid handle; at most as many ids as the array has elements; the type is
+    // a string of the library or null.
     unsafe {
         let list = api.heif_image_handle_get_list_of_metadata_block_IDs;
         let count = list(handle, c"mime".as_ptr(), ids.as_mut_ptr(), ids.len() as c_int);
@@ -401,7 +401,7 @@ unsafe fn xmp(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
     }
 }
 
-/// A block of metadata.
+/// Content of a block of metadata.
 unsafe fn block(api: &Api, handle: Pointer, id: u32) -> Option<Vec<u8>> {
     // SAFETY: the caller's valid handle and id; the block's own size is allocated.
     unsafe {
@@ -415,11 +415,11 @@ unsafe fn block(api: &Api, handle: Pointer, id: u32) -> Option<Vec<u8>> {
     }
 }
 
-/// The first EXIF block. It begins with the distance of the TIFF header from the end of these four
-/// bytes.
+/// The first EXIF block, from its TIFF header on. Its first four bytes are the offset of that
+/// header from their end.
 unsafe fn exif(api: &Api, handle: Pointer) -> Option<Vec<u8>> {
     let mut id = 0u32;
-    // SAFETY: the caller's valid handle; one id is asked for.
+    // SAFETY: the caller's valid handle; one id is requested.
     let block = unsafe {
         let list = api.heif_image_handle_get_list_of_metadata_block_IDs;
         if list(handle, c"Exif".as_ptr(), &mut id, 1) < 1 {

@@ -1,10 +1,10 @@
-//! Which camera of a file belongs to which photo: the one rule for it.
+//! Assignment of a file's cameras to photos: the one rule for it.
 use super::kind::stem;
 use std::collections::HashMap;
 use unicode_normalization::UnicodeNormalization;
 
-/// A name as it is compared: its folders apart by "/", letters composed (macOS writes them with
-/// their accents apart), without blanks around it.
+/// A name in normal form for comparison: folders separated by "/", composed letters (macOS
+/// decomposes accents), no surrounding blanks.
 pub fn plain_name(name: &str) -> String {
     let composed: String = name.trim().nfc().collect();
     let parts = composed.split(['/', '\\']).filter(|p| !p.is_empty() && *p != ".");
@@ -24,13 +24,13 @@ impl Name {
         Name { stem: stem(&file).to_owned(), folders: parts, file }
     }
 
-    /// How many folders, from the last one on, are those of the other.
+    /// Number of equal folders, counted from the last one.
     fn shared_folders(&self, folders: &[String]) -> usize {
         self.folders.iter().rev().zip(folders.iter().rev()).take_while(|(a, b)| a == b).count()
     }
 
-    /// How well the file names agree: in every letter, but for the case of the extension, but for
-    /// the extension, but for the case; 0 = not.
+    /// Agreement of the file names: 4 equal, 3 except the case of the extension, 2 except the
+    /// extension, 1 except the case; 0 = different.
     fn agreement(&self, other: &Name) -> u8 {
         if self.file == other.file {
             4
@@ -46,15 +46,23 @@ impl Name {
     fn key(&self) -> String {
         self.stem.to_lowercase()
     }
+
+    /// The stem, prefixed by its last `count` folders.
+    fn stem_with_folders(&self, count: usize) -> String {
+        let skipped = self.folders.len().saturating_sub(count);
+        let front = self.folders[skipped..].iter().filter(|f| *f != "..");
+        front.chain([&self.stem]).cloned().collect::<Vec<_>>().join("_")
+    }
 }
 
-/// The index of the camera of every photo, by the path of the photo and the name that the file
-/// gives the camera; `None` where there is none. Of several the one whose folders agree with the
-/// photo's path furthest back from the file name, then the one whose file name agrees best. Where
-/// cameras name the photo's own folder, those of other folders are not meant.
+/// Index of the camera of every photo, by the path of the photo and the camera's name in the file;
+/// `None` where no camera fits. Of several, the one whose folders agree with the photo's path
+/// furthest back from the file name, then the one whose file name agrees best. Where camera names
+/// contain the photo's own folder, cameras of other folders do not fit.
 ///
 /// # Errors
-/// Two cameras that fit a photo alike, or two photos that fit a camera alike; the text names them.
+/// Two cameras that fit a photo equally, or two photos that fit a camera equally; the text names
+/// them.
 pub fn join(photos: &[impl AsRef<str>], cameras: &[impl AsRef<str>]) -> Result<Vec<Option<usize>>, String> {
     let keys: Vec<Name> = cameras.iter().map(|c| Name::new(c.as_ref())).collect();
     let mut by_stem: HashMap<String, Vec<usize>> = HashMap::new();
@@ -62,14 +70,15 @@ pub fn join(photos: &[impl AsRef<str>], cameras: &[impl AsRef<str>]) -> Result<V
     let mut folders: Vec<&[String]> = keys.iter().map(|k| k.folders.as_slice()).collect();
     folders.sort_unstable();
     folders.dedup();
-    let one = |photo: &Name| -> Result<Option<Fit>, [usize; 2]> {
+    let best_fit = |photo: &Name| -> Result<Option<Fit>, [usize; 2]> {
         let own = folders.iter().map(|f| photo.shared_folders(f)).max().unwrap_or(0);
-        let meant = |k: &usize| keys[*k].folders.is_empty() || photo.shared_folders(&keys[*k].folders) == own;
+        let is_eligible =
+            |k: &usize| keys[*k].folders.is_empty() || photo.shared_folders(&keys[*k].folders) == own;
         let mut fits: Vec<Fit> = by_stem
             .get(&photo.key())
             .into_iter()
             .flatten()
-            .filter(|k| meant(k))
+            .filter(|k| is_eligible(k))
             .map(|&camera| Fit {
                 how: (photo.shared_folders(&keys[camera].folders), photo.agreement(&keys[camera])),
                 camera,
@@ -83,7 +92,7 @@ pub fn join(photos: &[impl AsRef<str>], cameras: &[impl AsRef<str>]) -> Result<V
     };
     let mut found: Vec<Option<Fit>> = Vec::with_capacity(photos.len());
     for photo in photos {
-        let fit = one(&Name::new(photo.as_ref())).map_err(|[a, b]| {
+        let fit = best_fit(&Name::new(photo.as_ref())).map_err(|[a, b]| {
             format!(
                 "{}: the cameras {:?} and {:?} both may be its own; give the photos in folders of the names that the camera file \
                  has, or rename one",
@@ -117,23 +126,17 @@ pub fn join(photos: &[impl AsRef<str>], cameras: &[impl AsRef<str>]) -> Result<V
     Ok(found.into_iter().map(|fit| fit.map(|f| f.camera)).collect())
 }
 
-/// A camera that may be that of a photo, and how well it fits: shared folders, then the agreement
-/// of the file names.
+/// A camera that may belong to a photo, and its fit: shared folders, then the agreement of the file
+/// names.
 #[derive(Clone, Copy)]
 struct Fit {
     how: (usize, u8),
     camera: usize,
 }
 
-/// A name of its own for each file: its stem, with the folders in front that it takes to tell them
-/// apart.
+/// A unique name for each file: its stem, prefixed by as many folders as needed.
 pub fn stems_apart(names: &[impl AsRef<str>]) -> Vec<String> {
     let all: Vec<Name> = names.iter().map(|n| Name::new(n.as_ref())).collect();
-    let with = |name: &Name, folders: usize| {
-        let skipped = name.folders.len().saturating_sub(folders);
-        let front = name.folders[skipped..].iter().filter(|f| *f != "..");
-        front.chain([&name.stem]).cloned().collect::<Vec<_>>().join("_")
-    };
     let mut stems: Vec<String> = all.iter().map(|n| n.stem.clone()).collect();
     let deepest = all.iter().map(|n| n.folders.len()).max().unwrap_or(0);
     for folders in 1..=deepest {
@@ -145,7 +148,7 @@ pub fn stems_apart(names: &[impl AsRef<str>]) -> Vec<String> {
         }
         for ((stem, name), twice) in stems.iter_mut().zip(&all).zip(twice) {
             if twice {
-                *stem = with(name, folders);
+                *stem = name.stem_with_folders(folders);
             }
         }
     }
@@ -157,16 +160,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn photos_find_cameras_by_path_and_name() {
+    fn join_matches_path_and_name() {
         let rig = ["cam1/0001.jpg", "cam2/0001.jpg", "cam2/0002.jpg"];
         assert_eq!(join(&["/data/rig/cam2/0001.jpg"], &rig), Ok(vec![Some(1)]));
         assert_eq!(join(&["cam1/0001.png", "cam2\\0001.JPG"], &rig), Ok(vec![Some(0), Some(1)]));
-        // The file names this folder: a photo of it has no camera of another one.
+        // The cameras contain this folder: a photo of it gets no camera of another folder.
         assert_eq!(join(&["x/cam1/0002.jpg"], &rig), Ok(vec![None]));
-        // Where it does not, a name that is there once is enough.
+        // Otherwise a unique name is sufficient.
         assert_eq!(join(&["small/0002.jpg"], &rig), Ok(vec![Some(2)]));
         assert_eq!(join(&["images/a.jpg"], &["a.jpg", "images/b.jpg"]), Ok(vec![Some(0)]));
-        // The longer of two paths that both end as the photo's.
+        // The longer of two paths that both end the photo's path.
         assert_eq!(join(&["r/left/images/a.jpg"], &["images/a.jpg", "left/images/a.jpg"]), Ok(vec![Some(1)]));
         let e = join(&["small/0001.jpg"], &rig).unwrap_err();
         assert!(
@@ -186,7 +189,7 @@ mod tests {
             ("a.png", "a.jpg"),
             ("IMG_1.jpg", "img_1.JPG"),
             ("r_0.png", "./train/r_0"),
-            // The same letter, composed and in two parts.
+            // The same letter, composed and decomposed.
             ("cafe\u{301}.jpg", "caf\u{e9}.jpg"),
         ] {
             assert_eq!(camera(photo, &[name]), Ok(Some(0)), "{photo} {name}");
@@ -197,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn stems_are_told_apart_by_folders() {
+    fn stems_apart_adds_folders() {
         assert_eq!(stems_apart(&["x/a.jpg", "y/b.jpg"]), ["a", "b"]);
         assert_eq!(stems_apart(&["r/cam1/1.jpg", "r/cam2/1.jpg", "2.jpg"]), ["cam1_1", "cam2_1", "2"]);
         assert_eq!(stems_apart(&["l/images/1.jpg", "r/images/1.jpg"]), ["l_images_1", "r_images_1"]);

@@ -1,23 +1,24 @@
-//! Whether a JPEG file is whole: its decoder fills a cut-off one with grey instead of reporting it,
-//! and grey areas would end up as geometry.
+//! Completeness of JPEG files: the decoder silently fills a truncated one with grey, and grey areas
+//! would become geometry.
 use super::kind::check_pixels;
 use image::codecs::jpeg::JpegDecoder;
 use image::{DynamicImage, ImageDecoder};
 use sha2::{Digest, Sha256};
 use std::io::Cursor;
 
-/// Walks the segments: true once the end-of-image marker is reached.
+/// Whether the end-of-image marker is reached.
 pub(super) fn has_end(bytes: &[u8]) -> bool {
     walk(bytes, |_, _| {})
 }
 
-/// Calls `segment` with the marker and content of every segment.
+/// Calls `segment` with the marker and content of every segment; returns whether the end-of-image
+/// marker is reached.
 fn walk(bytes: &[u8], mut segment: impl FnMut(u8, &[u8])) -> bool {
     let mut at = 2;
     let mut in_scan = false;
     while at + 1 < bytes.len() {
         if bytes[at] != 0xff {
-            // Entropy-coded data, or stray bytes between segments that decoders skip too.
+            // Entropy-coded data, or stray bytes between segments that decoders skip, too.
             at += 1;
             continue;
         }
@@ -39,14 +40,14 @@ fn walk(bytes: &[u8], mut segment: impl FnMut(u8, &[u8])) -> bool {
     false
 }
 
-/// What may follow the last byte of a file without its end. Every Huffman code reads these bits in
-/// another way, so that pixels which are not in the file come out differently.
+/// Bytes to append to a file without its end. Every Huffman code reads them differently, so that
+/// missing pixels decode differently.
 const FILLERS: [u8; 4] = [0x00, 0x55, 0xaa, 0x36];
-/// Bytes of it: the first missing block tells.
+/// Number of bytes to append: the first missing block is enough.
 const FILLED: usize = 4096;
 
-/// Whether all pixels are in a file without its end marker: whatever follows changes none of them.
-/// Only for sequential files, whose scans show all components; a progressive file may lack whole
+/// Whether a file without its end marker contains all pixels: no appended bytes change any of them.
+/// Only for sequential files whose scans contain all components; a progressive file may lack whole
 /// scans.
 pub(super) fn has_all_pixels(bytes: &[u8]) -> bool {
     let (mut components, mut scanned, mut is_sequential) = (0, 0, false);
@@ -63,13 +64,13 @@ pub(super) fn has_all_pixels(bytes: &[u8]) -> bool {
     }
     // The first half of the marker may be there.
     let body = bytes.strip_suffix(&[0xff]).unwrap_or(bytes);
-    let with = |filler: &u8| pixels([body, &[*filler; FILLED], &[0xff, 0xd9]].concat());
-    let first = with(&FILLERS[0]);
-    first.is_some() && FILLERS[1..].iter().all(|filler| with(filler) == first)
+    let filled_with = |filler: &u8| pixel_checksum([body, &[*filler; FILLED], &[0xff, 0xd9]].concat());
+    let first = filled_with(&FILLERS[0]);
+    first.is_some() && FILLERS[1..].iter().all(|filler| filled_with(filler) == first)
 }
 
-/// A checksum of the decoded pixels.
-fn pixels(file: Vec<u8>) -> Option<[u8; 32]> {
+/// Checksum of the decoded pixels.
+fn pixel_checksum(file: Vec<u8>) -> Option<[u8; 32]> {
     let decoder = JpegDecoder::new(Cursor::new(file)).ok()?;
     let (w, h) = decoder.dimensions();
     check_pixels(w.into(), h.into()).ok()?;

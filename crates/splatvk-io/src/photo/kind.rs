@@ -1,18 +1,17 @@
-//! What kind of file it is, by its first bytes or its name, and what to do with the kinds that are
-//! not read.
+//! Format of a file by its first bytes or its name, and advice for unsupported formats.
 use super::tiff::Directories;
 use crate::scene::MAX_PIXELS;
 use crate::{Error, Result};
 use image::ImageFormat;
 use std::path::Path;
 
-/// Names of photos that are read. OpenEXR and Radiance hold linear light.
+/// Extensions of supported photos. OpenEXR and Radiance contain linear light.
 const PHOTO: [&str; 14] =
     ["jpg", "jpeg", "jpe", "jfif", "png", "webp", "tif", "tiff", "heic", "heif", "hif", "avif", "exr", "hdr"];
 const VIDEO: [&str; 14] =
     ["mp4", "m4v", "mov", "qt", "avi", "mkv", "webm", "mpg", "mpeg", "wmv", "3gp", "3g2", "mts", "m2ts"];
-/// Of Canon, Nikon, Sony, Olympus, Fujifilm, Panasonic, Leica, Pentax, Samsung, Hasselblad, Phase
-/// One, Mamiya, Minolta, Kodak, Epson, Sigma, GoPro and Apple's and Adobe's DNG.
+/// Extensions of Canon, Nikon, Sony, Olympus, Fujifilm, Panasonic, Leica, Pentax, Samsung,
+/// Hasselblad, Phase One, Mamiya, Minolta, Kodak, Epson, Sigma, GoPro and Apple's and Adobe's DNG.
 const RAW: [&str; 28] = [
     "dng", "cr2", "cr3", "crw", "nef", "nrw", "arw", "srf", "sr2", "orf", "raf", "rw2", "raw", "rwl", "pef",
     "srw", "3fr", "fff", "iiq", "mef", "mos", "mrw", "dcr", "kdc", "k25", "erf", "x3f", "gpr",
@@ -20,15 +19,15 @@ const RAW: [&str; 28] = [
 const OTHER_IMAGE: [&str; 12] =
     ["bmp", "gif", "jxl", "jp2", "j2k", "psd", "tga", "svg", "pdf", "ppm", "pgm", "insp"];
 
-/// The kinds that are read, for messages.
+/// Supported formats, for messages.
 pub(super) const READ: &str = "JPEG, PNG, HEIC, AVIF, WebP or TIFF";
 
-/// Most memory a decoded file may take: four times the largest photo that phones write (200
+/// Largest memory of a decoded file, bytes: four times the largest photo that phones write (200
 /// megapixels, 8 bit).
 pub(super) const LARGEST_DECODED: u64 = 2 << 30;
 pub(super) const TOO_LARGE: &str = "the image needs more than 2 GiB of memory; make it smaller";
 
-/// Refuses images of more than [`MAX_PIXELS`]: a few bytes can state any size.
+/// Refuses images of more than [`MAX_PIXELS`]: a short header can state any size.
 pub(super) fn check_pixels(w: u64, h: u64) -> Result<(), String> {
     match w.saturating_mul(h) <= MAX_PIXELS {
         true => Ok(()),
@@ -50,9 +49,9 @@ fn has_extension(path: &Path, list: &[&str]) -> bool {
     path.extension().is_some_and(|e| list.iter().any(|l| e.eq_ignore_ascii_case(l)))
 }
 
-/// What joins a photo to its camera, masks and renders: its file name without folder and extension.
-/// Only the extensions of pictures are cut, so that the stem of a stem is itself, and "view.2" a
-/// name of its own.
+/// Key that joins a photo to its camera, masks and renders: its file name without folder and
+/// extension. Only the extensions of images are removed, so that the stem of a stem is itself, and
+/// "view.2" remains distinct.
 pub fn stem(file: &str) -> &str {
     let name = file.rsplit(['/', '\\']).next().unwrap_or(file);
     let picture =
@@ -71,7 +70,7 @@ pub(super) fn is_video_name(path: &Path) -> bool {
     has_extension(path, &VIDEO)
 }
 
-/// Images that nothing here reads: worth a word when a folder holds them.
+/// Unsupported image formats, which are reported where a folder contains them.
 pub(super) fn is_foreign_name(path: &Path) -> bool {
     is_raw_name(path) || has_extension(path, &OTHER_IMAGE)
 }
@@ -81,18 +80,18 @@ pub(super) fn is_raw_name(path: &Path) -> bool {
     has_extension(path, &RAW)
 }
 
-/// Names of files in which one photo may lie beside others of the same stem: what phones and
-/// cameras write two of. PNG is not among them: it holds masks and cut-outs.
+/// Whether the format is one that phones and cameras write two of per photo, with the same stem.
+/// PNG is excluded: it is used for masks and cut-outs.
 pub(super) fn is_camera_format(path: &Path) -> bool {
     is_photo_name(path) && !has_extension(path, &["png", "exr", "hdr", "webp"])
 }
 
-/// JPEG by its name.
+/// Whether the name is that of a JPEG.
 pub(super) fn is_jpeg_name(path: &Path) -> bool {
     has_extension(path, &["jpg", "jpeg", "jpe", "jfif"])
 }
 
-/// Whether a file whose name is not that of a photo begins as one.
+/// Whether a file without the name of a photo has the first bytes of one.
 pub(super) fn begins_as_photo(path: &Path) -> bool {
     use std::io::Read as _;
     let mut start = Vec::new();
@@ -103,32 +102,32 @@ pub(super) fn begins_as_photo(path: &Path) -> bool {
             || brand(&start) == Some(FileKind::Heif))
 }
 
-/// Bytes of the longest stem: the scene's files are named after it, and cameras take names of 200
-/// bytes.
+/// Longest stem, bytes: files of a scene are named after it, and camera names have 200 bytes at
+/// most.
 const LONGEST_STEM: usize = 196;
 
-/// Refuses names of photos that files of a scene cannot be named after: that are no Unicode, have
-/// control characters, or are too long.
+/// Refuses names of photos that files of a scene cannot be named after: those that are not Unicode,
+/// contain control characters, or are too long.
 pub fn check_name(path: &Path) -> Result<()> {
     let shown = path.to_string_lossy();
-    let bad = |what: String| {
+    let refuse = |what: String| {
         let start: String = shown.chars().rev().take(60).collect::<Vec<_>>().into_iter().rev().collect();
         let cut = if start.len() < shown.len() { "…" } else { "" };
         Err(Error::input(format!("{cut}{start}: {what}; rename the photo")))
     };
     let name = stem(&shown);
     if path.to_str().is_none() {
-        bad("its path is not Unicode (UTF-8), so that no file of the scene can name it".to_owned())
+        refuse("its path is not Unicode (UTF-8), so that no file of the scene can name it".to_owned())
     } else if name.chars().any(char::is_control) {
-        bad("a control character is in its name".to_owned())
+        refuse("a control character is in its name".to_owned())
     } else if name.len() > LONGEST_STEM {
-        bad(format!("a name of {} bytes is too long, {LONGEST_STEM} are the most", name.len()))
+        refuse(format!("a name of {} bytes is too long, {LONGEST_STEM} are the most", name.len()))
     } else {
         Ok(())
     }
 }
 
-/// What reads a file, or why nothing does.
+/// Decoder of a file, or the reason of a refusal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum FileKind {
     /// A codec of the `image` crate.
@@ -136,12 +135,12 @@ pub(super) enum FileKind {
     /// HEIC, HEIF or AVIF: libheif.
     Heif,
     Video,
-    /// Completes "NAME: ".
+    /// Text that completes "NAME: ".
     Refused(&'static str),
     Unknown,
 }
 
-/// The kind of a file's bytes; the name decides where they say nothing.
+/// Kind of a file by its bytes; the name decides where they are ambiguous.
 pub(super) fn kind(bytes: &[u8], path: &Path) -> FileKind {
     if let Some(brand) = brand(bytes) {
         return brand;
@@ -183,7 +182,7 @@ pub(super) fn kind(bytes: &[u8], path: &Path) -> FileKind {
     }
 }
 
-/// Files of ISO boxes by their brands: HEIF, Canon's raw, or else a video.
+/// Kind of files of ISO boxes by their brand: HEIF, Canon's raw, or else a video.
 fn brand(bytes: &[u8]) -> Option<FileKind> {
     const HEIF: [&[u8; 4]; 12] = [
         b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"mif2", b"msf1", b"miaf", b"avif",
@@ -200,8 +199,8 @@ fn brand(bytes: &[u8]) -> Option<FileKind> {
     })
 }
 
-/// Raw files in the clothes of TIFF: their first image is a thumbnail or a mosaic, and would pass
-/// for the photo.
+/// Whether a TIFF is a raw file: its first image is a thumbnail or a mosaic, and would be read as
+/// the photo.
 fn is_raw(bytes: &[u8]) -> bool {
     use exif::{Context, In, Tag};
     if bytes.get(8..10) == Some(b"CR") {
@@ -225,7 +224,7 @@ mod tests {
     use exif::{Context, Tag, Value};
 
     #[test]
-    fn files_are_told_by_their_bytes() {
+    fn kind_is_decided_by_bytes() {
         use ImageFormat as F;
         let cases: [(&[u8], &str, FileKind); 14] = [
             (b"\0\0\0\x18ftypmp42....", "a.jpg", FileKind::Video),
@@ -267,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn names_that_no_scene_can_hold_are_refused() {
+    fn unusable_photo_names_are_refused() {
         let refused = |name: &str| check_name(Path::new(name)).err().map(|e| e.to_string());
         assert_eq!(refused(&format!("f/{}.jpg", "x".repeat(196))), None);
         assert_eq!(refused(&format!("f/{}.jpg", "写".repeat(65))), None);
@@ -291,15 +290,15 @@ mod tests {
     }
 
     #[test]
-    fn raw_files_are_not_taken_for_tiff() {
+    fn raw_files_are_not_tiff() {
         let long = |v| Value::Long(vec![v]);
         let tiff = |tags: &[(u16, Value)]| {
             let tags: Vec<_> = tags.iter().map(|(t, v)| (Tag(Context::Tiff, *t), v.clone())).collect();
             kind(&block(&tags), Path::new("a.tif"))
         };
         assert_eq!(tiff(&[(0x100, long(10))]), FileKind::Image(ImageFormat::Tiff));
-        // A page of a multi-page file may be called reduced; only with the real image elsewhere is
-        // it a thumbnail.
+        // A page of a multi-page file may be declared reduced; it is a thumbnail only if the real
+        // image is elsewhere.
         assert_eq!(tiff(&[(0xfe, long(1))]), FileKind::Image(ImageFormat::Tiff));
         assert_eq!(tiff(&[(0xc612, Value::Byte(vec![1, 4, 0, 0]))]), FileKind::Refused(RAW_ADVICE));
         assert_eq!(tiff(&[(0xfe, long(1)), (0x14a, long(99))]), FileKind::Refused(RAW_ADVICE));

@@ -1,24 +1,24 @@
-//! Exposure, white balance and vignetting of one photo relative to the scene's light, and their
-//! removal.
+//! Photometric calibration of one photo: exposure, white balance and vignetting relative to the
+//! scene, and their removal.
 use crate::scene::{RgbImage, to_linear, to_srgb};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// A photo shows `gain[c] · exp(falloff[0] r² + falloff[1] r⁴)` times the scene's light, in linear
-/// light; r is the distance from the image centre in half diagonals, 1 in the corners.
+/// The photo is `gain[c] · exp(falloff[0] r² + falloff[1] r⁴)` times the scene, in linear light; r
+/// is the distance from the image centre in half diagonals, 1 in the corners.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Light {
-    /// Per channel; 1 = the scene's light.
+    /// Per channel; 1 = as in the scene.
     pub gain: [f64; 3],
     /// Vignetting as ln per r² and r⁴; 0 = none.
     pub falloff: [f64; 2],
     /// One standard deviation of the exposure, EV; 0 where nothing was estimated.
     pub sigma_ev: f64,
-    /// One standard deviation of the corner's brightness, as a share of it; 0 where nothing was
+    /// One standard deviation of the corner's brightness, relative to it; 0 where nothing was
     /// estimated.
     pub sigma_corner: f64,
-    /// Difference to the other photos' brightness, ln, that all this leaves in the tenth of the
-    /// photo's parts that fits worst; 0 where nothing was estimated.
+    /// Remaining difference to the brightness of the other photos, ln, in the tenth of the photo's
+    /// parts that fits worst; 0 where nothing was estimated.
     pub unexplained: f64,
 }
 
@@ -29,40 +29,40 @@ impl Default for Light {
 }
 
 impl Light {
-    /// The scene's own light: nothing to take out.
+    /// The scene's own light: no correction.
     pub const NONE: Light =
         Light { gain: [1.0; 3], falloff: [0.0; 2], sigma_ev: 0.0, sigma_corner: 0.0, unexplained: 0.0 };
-    /// What may be left unexplained before the user should know of it, ln: half an f-stop.
+    /// Largest unexplained difference without a warning, ln: half an f-stop.
     const UNEXPLAINED: f64 = 0.35;
 
-    /// False where parts of the photo are lit differently than in the others: highlights, flash, a
-    /// moving shadow.
+    /// Whether the model fits the photo; false where parts are lit differently than in the other
+    /// photos: highlights, flash, a moving shadow.
     pub fn explains_the_photo(&self) -> bool {
         self.unexplained <= Light::UNEXPLAINED
     }
 
-    /// True where the photo is left as it is.
+    /// Whether the photo needs no correction.
     pub fn is_none(&self) -> bool {
         self.gain == [1.0; 3] && self.falloff == [0.0; 2]
     }
 
-    /// Exposure against the scene's light, EV: the mean over the channels in log light.
+    /// Exposure relative to the scene, EV: the mean over the channels in log light.
     pub fn exposure_ev(&self) -> f64 {
         self.gain.iter().map(|g| g.log2()).sum::<f64>() / 3.0
     }
 
-    /// Red and blue against green, 1 = as the scene's light.
+    /// Red and blue relative to green; 1 = as in the scene.
     pub fn white_balance(&self) -> [f64; 2] {
         [self.gain[0] / self.gain[1], self.gain[2] / self.gain[1]]
     }
 
-    /// Brightness in the corners as a share of the centre's.
+    /// Brightness of the corners relative to the centre.
     pub fn corner(&self) -> f64 {
         (self.falloff[0] + self.falloff[1]).exp()
     }
 
-    /// "+0.31 EV, red +3 %, blue −2 %, corners −17 %": what is not zero at this precision; empty
-    /// for [`Light::NONE`].
+    /// Non-zero terms at this precision: "+0.31 EV, red +3 %, blue −2 %, corners −17 %"; empty for
+    /// [`Light::NONE`].
     pub fn summary(&self) -> String {
         let percent = |v: f64| (100.0 * (v - 1.0)).round();
         let signed = |v: f64| if v < 0.0 { format!("−{}", -v) } else { format!("+{v}") };
@@ -85,13 +85,13 @@ impl Light {
         (self.falloff[0] + self.falloff[1] * r2) * r2
     }
 
-    /// The image in the scene's light. Values may exceed 1: where the photo is brighter than the
-    /// scene's light would make it, nothing is lost by that.
+    /// The image with the corrections applied. Values may exceed 1 where the correction brightens
+    /// the photo, so that nothing is clipped.
     pub fn removed(&self, image: &RgbImage) -> RgbImage {
         self.scaled(image, -1.0)
     }
 
-    /// An image in the scene's light as this photo shows it.
+    /// Inverse of [`Light::removed`]: a corrected image as this photo shows it.
     pub fn applied(&self, image: &RgbImage) -> RgbImage {
         self.scaled(image, 1.0)
     }
@@ -131,7 +131,7 @@ mod tests {
     }
 
     #[test]
-    fn light_goes_out_as_it_came_in() {
+    fn light_removal_inverts_application() {
         let light = Light { gain: [1.4, 0.7, 1.1], falloff: [-0.3, -0.1], ..Light::NONE };
         let (image, lit) = (picture(), light.applied(&picture()));
         let back = light.removed(&lit);
@@ -151,14 +151,14 @@ mod tests {
     }
 
     #[test]
-    fn the_summary_names_what_is_there() {
+    fn light_summary_lists_nonzero_terms() {
         let light = Light { gain: [1.1, 1.0, 0.95], falloff: [-0.2, 0.0], ..Light::NONE };
         assert_eq!(light.summary(), "+0.02 EV, red +10 %, blue −5 %, corners −18 %");
         assert_eq!(Light::NONE.summary(), "");
     }
 
     #[test]
-    fn no_light_changes_no_bit() {
+    fn light_none_changes_nothing() {
         assert_eq!(Light::NONE.removed(&picture()), picture());
         assert!(Light::default().is_none());
     }

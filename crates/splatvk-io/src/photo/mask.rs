@@ -1,4 +1,4 @@
-//! Masks of the pixels that are used, as COLMAP and nerfstudio take them: black is not used.
+//! Masks of used pixels, in the convention of COLMAP and nerfstudio: black is not used.
 use super::decode::{self, Decoded, is_sideways, stored_position};
 use super::kind::{FileKind, kind};
 use crate::{Error, Result, files};
@@ -7,21 +7,21 @@ use image::metadata::Orientation;
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
-/// A mask in memory.
+/// A decoded mask.
 pub(super) struct Mask {
     path: PathBuf,
     /// Pixels.
     size: (usize, usize),
     /// [H, W].
     used: Vec<bool>,
-    /// More than black and one other value: the numbers of things rather than a mask.
+    /// Whether it has several values beside black: instance labels rather than a mask.
     pub is_labels: bool,
 }
 
-/// Black of a JPEG is not exactly black.
+/// Threshold of JPEG masks, whose black is not exact.
 const JPEG_BLACK: f32 = 0.5;
 
-/// Aspects that differ less are one: sizes are whole numbers.
+/// Largest relative difference of equal aspects: sizes are whole numbers.
 const SAME_ASPECT: f64 = 0.01;
 
 impl Mask {
@@ -42,7 +42,7 @@ impl Mask {
         let mut levels: Vec<f32> = values.iter().copied().filter(|v| *v > 0.0).collect();
         levels.sort_by(f32::total_cmp);
         levels.dedup();
-        // Soft edges of one thing have many levels, and few pixels at them.
+        // Soft edges of one thing have many levels, but few pixels at them.
         let most = levels.last().copied().unwrap_or(0.0);
         let between = values.iter().filter(|v| **v > 0.1 * most && **v < 0.9 * most).count();
         let is_labels = levels.len() > 1 && 20 * between > w * h;
@@ -51,7 +51,7 @@ impl Mask {
     }
 
     /// Whether upright pixels of a photo are used. The mask may have another size of the same
-    /// aspect, and lie as the photo does or as its file does.
+    /// aspect, and the orientation of the photo or of its file.
     pub fn on(
         &self,
         photo: &Path,

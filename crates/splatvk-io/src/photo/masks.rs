@@ -1,4 +1,4 @@
-//! Which photo has which mask.
+//! Assignment of masks to photos.
 use super::candidate::Candidate;
 use super::kind::stem;
 use super::mask::Mask;
@@ -6,17 +6,17 @@ use crate::progress::Progress;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Where the masks of photos come from.
+/// Sources of masks.
 #[derive(Clone, Debug, Default)]
 pub struct MaskChoice {
-    /// A folder of masks, instead of one beside the folder of photos.
+    /// Folder of masks, instead of one beside the folder of photos.
     pub folder: Option<PathBuf>,
-    /// Masks that a camera file names, by the name of its frame.
+    /// Masks that a camera file names, by the name of the frame.
     pub named: Vec<(String, PathBuf)>,
 }
 
 impl MaskChoice {
-    /// The mask of the frame that has the photo's path, or else of the only one that has its name.
+    /// Mask of the frame with the photo's path, or else of the only frame with its stem.
     fn named_for(&self, photo: &Path) -> Option<&PathBuf> {
         let own = photo.file_name()?.to_string_lossy();
         let whole = self.named.iter().find(|(frame, _)| photo.ends_with(frame.trim_start_matches("./")));
@@ -26,7 +26,7 @@ impl MaskChoice {
     }
 }
 
-/// Gives photos their masks and says which have one.
+/// Assigns masks to photos and reports which photos have one.
 pub fn assign(photos: &mut [Candidate], choice: &MaskChoice, progress: &dyn Progress) -> Result<()> {
     if let Some(folder) = choice.folder.as_ref().filter(|f| !f.is_dir()) {
         return Err(Error::input(format!(
@@ -74,8 +74,8 @@ fn report(
         }
         return Ok(());
     };
-    // Warnings are kept in scenes, which are passed on: a folder that nobody typed is named without
-    // those above it.
+    // Warnings are stored in scenes, which are passed on: a folder that the user did not type is
+    // named without its parents.
     let named = match &choice.folder {
         Some(typed) => typed.display().to_string(),
         None => file_name(&folder),
@@ -106,8 +106,8 @@ fn file_name(path: &Path) -> String {
     path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-/// The folder of images that a photo is in, itself or below it, and the folders from there to the
-/// photo.
+/// Folder of images that contains a photo directly or further below, and the path from it to the
+/// photo's folder.
 fn image_folder(photo: &Path) -> Option<(&Path, &Path)> {
     let folder = photo.parent()?;
     let is_images = |f: &&Path| {
@@ -121,8 +121,8 @@ fn image_folder(photo: &Path) -> Option<(&Path, &Path)> {
 /// Folders between a photo and `images`: one per camera of a rig, and one of the camera itself.
 const DEEPEST: usize = 3;
 
-/// `masks` beside `images`, `masks_2` beside `images_2`. Beside the ground truth of `splatvk
-/// generate` it holds labels.
+/// Mask folder of a photo: `masks` beside `images`, `masks_2` beside `images_2`. Beside the ground
+/// truth of `splatvk generate` it contains labels, and is ignored.
 fn folder_beside(photo: &Path) -> Option<PathBuf> {
     let (images, _) = image_folder(photo)?;
     let name = images.file_name()?.to_str()?;
@@ -131,8 +131,8 @@ fn folder_beside(photo: &Path) -> Option<PathBuf> {
     there.into_iter().find(|m| m != images && m.is_dir() && !root.join("ground_truth.json").exists())
 }
 
-/// `x.jpg.png` (COLMAP), or `x` with an extension of its own (nerfstudio); of a photo in a folder
-/// of its camera in such a folder.
+/// Mask file of a photo: `x.jpg.png` (COLMAP), or `x` with its own extension (nerfstudio); for a
+/// photo in a camera's folder, in the folder of the same name if there is one.
 fn in_folder(folder: &Path, photo: &Path) -> Option<PathBuf> {
     let below = image_folder(photo).map(|(_, below)| folder.join(below)).filter(|f| f.is_dir());
     let folder = below.unwrap_or_else(|| folder.to_path_buf());

@@ -58,12 +58,12 @@ use sha2::{Digest, Sha256};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Support for HEIC and AVIF photos.
+/// Reports the support for HEIC and AVIF photos.
 pub fn heif_support() -> Support {
     heif::status()
 }
 
-/// Support for videos.
+/// Reports the support for videos.
 pub fn video_support() -> Support {
     video::status()
 }
@@ -76,27 +76,27 @@ pub fn load_all(inputs: &[PathBuf], progress: &dyn Progress) -> Result<Vec<Photo
     load_each(&found, MAX_SIZE, progress)
 }
 
-/// Reads the photos of a run, each scaled down to `max_size` where it is larger; refuses sets that
-/// cannot give geometry (the same photo twice) or that would mix up files (the same name twice).
+/// Reads the photos of a run, scaled down to `max_size` where larger; refuses sets that cannot give
+/// geometry (the same photo twice) or with ambiguous names (the same name twice).
 pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progress) -> Result<Vec<Photo>> {
     candidates.iter().try_for_each(|c| check_name(&c.path))?;
     progress.begin("photos", candidates.len() as u64);
     let done = AtomicU64::new(0);
-    let one = |candidate: &Candidate| {
+    let load_one = |candidate: &Candidate| {
         progress.check()?;
         let photo = candidate.load(max_size, progress)?;
         progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
         Ok(photo)
     };
-    // Collected before errors are looked at: the first in the order of the photos is reported,
+    // Collected before errors are checked: the first error in the order of the photos is reported,
     // whichever came first.
     let mut all: Vec<Result<Photo>> = Vec::with_capacity(candidates.len());
     for wave in sizes::waves(candidates) {
-        all.par_extend(candidates[wave].par_iter().map(one));
+        all.par_extend(candidates[wave].par_iter().map(load_one));
     }
     let mut photos = all.into_iter().collect::<Result<Vec<_>>>()?;
     for bars in bars::find(&photos) {
-        // The picture gets the pixels that the whole file would have had.
+        // Reloaded so that the picture gets as many pixels as the whole file would have had.
         let photo = &photos[bars.photo];
         let (w, h) = (photo.image.width, photo.image.height);
         let gain = w.max(h) as f64 / bars.picture_long_side(photo);
@@ -111,15 +111,15 @@ pub fn load_each(candidates: &[Candidate], max_size: usize, progress: &dyn Progr
     Ok(photos)
 }
 
-/// What is decided and said of photos once all of a set are read; `known` are those of a scene that
-/// they join.
+/// Warns of files and decides the meaning of transparency, once all photos of a set are read;
+/// `known` are the photos of a scene that they join.
 pub fn settle(photos: &mut [Photo], known: &[Photo], progress: &dyn Progress) {
     warn_of_files(photos, progress);
     settle_transparency(photos, known, progress);
 }
 
-/// Decides what transparent pixels of a set stand for: nothing, where every photo has some and none
-/// a mask, as in photos of things whose background was removed; else they are only not used.
+/// Decides the meaning of transparent pixels of a set: empty space if every photo has some and none
+/// has a mask, as in photos with removed background; otherwise they are unused.
 fn settle_transparency(photos: &mut [Photo], known: &[Photo], progress: &dyn Progress) {
     let named = |wanted: &dyn Fn(&Photo) -> bool, photos: &[Photo]| {
         photos.iter().filter(|p| wanted(p)).map(|p| p.stem.as_str()).collect::<Vec<_>>().join(", ")
@@ -143,7 +143,7 @@ fn settle_transparency(photos: &mut [Photo], known: &[Photo], progress: &dyn Pro
     photos.iter_mut().flat_map(|p| &mut p.coverage).for_each(|c| c.outside = Outside::Empty);
 }
 
-/// Says what of the files is not used or looks odd.
+/// Warns of parts of the files that are not used or look unusual.
 fn warn_of_files(photos: &[Photo], progress: &dyn Progress) {
     for photo in photos {
         photo.notes.iter().for_each(|note| progress.warn(&format!("{}: {note}", photo.stem)));
@@ -169,7 +169,7 @@ fn warn_of_files(photos: &[Photo], progress: &dyn Progress) {
     }
 }
 
-/// Cuts off the bars beside the pictures: letterboxes, frames and captions. Says so.
+/// Cuts off the bars beside the pictures (letterboxes, frames and captions) with a warning.
 pub fn cut_bars(photos: &mut [Photo], progress: &dyn Progress) {
     let found = bars::find(photos);
     if let Some(text) = bars::message(photos, &found) {
@@ -178,45 +178,26 @@ pub fn cut_bars(photos: &mut [Photo], progress: &dyn Progress) {
     found.iter().for_each(|bars| photos[bars.photo].cut(bars.depth));
 }
 
-/// Files of high dynamic range in another unit: matching and training expect diffuse surfaces below
-/// 1.
+/// Whether a file of high dynamic range uses another unit: matching and training expect diffuse
+/// surfaces below 1.
 fn mostly_above_white(image: &RgbImage) -> bool {
     let above = image.data.iter().filter(|c| c.iter().any(|v| *v > 1.0)).count();
     2 * above > image.data.len()
 }
 
-/// EXIF focal lengths of one camera that differ more come from different zoom settings.
+/// Largest relative difference of EXIF focal lengths of one zoom setting.
 const SAME_ZOOM: f64 = 0.03;
 
-/// Sides of pictures between bars that differ by less are the same.
+/// Largest relative difference of the sides of equal pictures between bars.
 const SAME_PICTURE: f64 = 0.02;
 
-/// Number of the camera of every photo, as far as the files state it: photos of one size, camera
-/// model and zoom have one, photos without EXIF share by size. Portrait and landscape of one camera
-/// share too.
+/// Camera index of every photo by the data in the files: photos of equal size, camera model and
+/// zoom share one; photos without EXIF share by size. Portrait and landscape photos of one camera
+/// share, too.
 pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
-    let size = |p: &Photo| {
-        let (w, h) = p.original_size;
-        (w.max(h), w.min(h))
-    };
-    // The edge of a bar is found to a pixel or two of the working image; uncut photos of one size
-    // have one picture.
-    let picture = |a: &Photo, b: &Photo| {
-        let sides = a.picture_size().into_iter().zip(b.picture_size());
-        let turned = a.picture_size().into_iter().rev().zip(b.picture_size());
-        let near = |(a, b): (f64, f64)| (a / b - 1.0).abs() < SAME_PICTURE;
-        sides.into_iter().all(near) || turned.into_iter().all(near)
-    };
-    let alike = |a: &Photo, b: &Photo| {
-        let one_zoom = match (a.original_focal(), b.original_focal()) {
-            (Some(f), Some(g)) => (f / g - 1.0).abs() <= SAME_ZOOM,
-            (f, g) => f.is_none() && g.is_none(),
-        };
-        size(a) == size(b) && picture(a, b) && a.camera_model == b.camera_model && one_zoom
-    };
     let mut firsts: Vec<&Photo> = Vec::new();
     let mut number = |photo| {
-        firsts.iter().position(|f| alike(f, photo)).unwrap_or_else(|| {
+        firsts.iter().position(|f| share_camera(f, photo)).unwrap_or_else(|| {
             firsts.push(photo);
             firsts.len() - 1
         })
@@ -224,8 +205,30 @@ pub fn cameras_by_file(photos: &[Photo]) -> Vec<usize> {
     photos.iter().map(&mut number).collect()
 }
 
-/// Refuses sets that cannot give geometry (one photo, or the same photo twice) or that would mix up
-/// files (the same name twice). [`load_all`] has done it; for photos from memory.
+/// Whether two photos are of one camera and zoom by the data in their files.
+fn share_camera(a: &Photo, b: &Photo) -> bool {
+    let size = |p: &Photo| {
+        let (w, h) = p.original_size;
+        (w.max(h), w.min(h))
+    };
+    let one_zoom = match (a.original_focal(), b.original_focal()) {
+        (Some(f), Some(g)) => (f / g - 1.0).abs() <= SAME_ZOOM,
+        (f, g) => f.is_none() && g.is_none(),
+    };
+    size(a) == size(b) && have_equal_pictures(a, b) && a.camera_model == b.camera_model && one_zoom
+}
+
+/// Whether the pictures between bars have equal sizes, in either orientation. The edge of a bar is
+/// accurate to a pixel or two of the working image; uncut photos of one size have equal pictures.
+fn have_equal_pictures(a: &Photo, b: &Photo) -> bool {
+    let sides = a.picture_size().into_iter().zip(b.picture_size());
+    let turned = a.picture_size().into_iter().rev().zip(b.picture_size());
+    let near = |(a, b): (f64, f64)| (a / b - 1.0).abs() < SAME_PICTURE;
+    sides.into_iter().all(near) || turned.into_iter().all(near)
+}
+
+/// Refuses sets that cannot give geometry (one photo, or the same photo twice) or with ambiguous
+/// names (the same name twice). Included in [`load_all`]; for photos from memory.
 pub fn check_set(photos: &[Photo]) -> Result<()> {
     if !(2..=MAX_VIEWS).contains(&photos.len()) {
         return Err(match photos {
@@ -240,7 +243,7 @@ pub fn check_set(photos: &[Photo]) -> Result<()> {
             )),
         });
     }
-    // The name that a photo goes by may have folders in front of that of its file.
+    // The stem of a photo may be prefixed by its folders.
     photos.iter().try_for_each(|p| check_name(&p.path).and_then(|()| check_name(p.stem.as_ref())))?;
     let digests: Vec<_> =
         photos.iter().map(|p| Sha256::digest(bytemuck::cast_slice(&p.image.data))).collect();
@@ -248,7 +251,7 @@ pub fn check_set(photos: &[Photo]) -> Result<()> {
         for i in 0..j {
             let (a, b) = (photos[i].path.display(), photos[j].path.display());
             if digests[i] == digests[j] && photos[i].image.width == photos[j].image.width {
-                // A photo added to the scene that has it already has one path.
+                // A photo that is added to a scene which already contains it has the same path.
                 let named = match photos[i].path == photos[j].path {
                     true => format!("{a}: this photo is there already"),
                     false => format!("{a} and {b}: the same photo twice"),
@@ -271,7 +274,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_same_photo_is_named_once_where_it_has_one_path() {
+    fn check_set_names_repeated_photo() {
         let photo = |path: &str| {
             let image = RgbImage { width: 64, height: 64, data: vec![[0.3; 3]; 64 * 64] };
             from_pixels(path.as_ref(), &image, None, MAX_SIZE).unwrap()
@@ -282,7 +285,7 @@ mod tests {
     }
 
     #[test]
-    fn photos_of_one_zoom_share_a_camera_and_those_of_another_do_not() {
+    fn photos_share_camera_by_zoom() {
         let image = RgbImage { width: 64, height: 64, data: vec![[0.3; 3]; 64 * 64] };
         let photo = |focal| from_pixels("a.png".as_ref(), &image, focal, MAX_SIZE).unwrap();
         // Rounding of the tags is 2 %.
@@ -291,13 +294,13 @@ mod tests {
     }
 
     #[test]
-    fn files_in_another_unit_are_noticed() {
+    fn pictures_above_white_are_detected() {
         let image = |v: f32| RgbImage { width: 2, height: 2, data: vec![[v; 3], [v; 3], [v; 3], [0.1; 3]] };
         assert!(mostly_above_white(&image(3.0)) && !mostly_above_white(&image(1.0)));
     }
 
     #[test]
-    fn the_longer_side_is_capped_and_nothing_is_enlarged() {
+    fn working_size_caps_longer_side() {
         assert_eq!(working_size(640, 480, 800), (640, 480));
         assert_eq!(working_size(800, 800, 800), (800, 800));
         assert_eq!(working_size(4032, 3024, 800), (800, 600));

@@ -1,16 +1,16 @@
-//! PNG files for the decoder: what is not pixels is taken out first, each within a bound, since its
-//! decoder inflates profiles and texts without one of their own.
+//! Metadata of PNG files, extracted within bounds before decoding: the decoder inflates profiles
+//! and texts without a bound.
 use super::metadata::{LARGEST_ICC, LARGEST_XMP, Metadata};
 use flate2::read::ZlibDecoder;
 use std::io::Read;
 
 /// Bytes of the signature.
 const SIGNATURE: usize = 8;
-/// Length, kind and sum of a chunk, bytes.
+/// Bytes of length, type and checksum of a chunk.
 const FRAME: usize = 12;
 const XMP: &[u8] = b"XML:com.adobe.xmp";
 
-/// Leaves the chunks that make pixels, and returns what the others say. Animations become their
+/// Removes all chunks that do not affect pixels, and returns their content. Animations become their
 /// first picture.
 pub(super) fn take_metadata(bytes: &mut Vec<u8>) -> Metadata {
     let mut found = Metadata::default();
@@ -26,7 +26,7 @@ pub(super) fn take_metadata(bytes: &mut Vec<u8>) -> Metadata {
         }
         from = end;
     }
-    // What is cut off is the decoder's to report.
+    // The decoder reports a truncated chunk.
     let rest = bytes.len().saturating_sub(from);
     if rest > 0 && from > to {
         bytes.copy_within(from.., to);
@@ -40,7 +40,7 @@ fn header(bytes: &[u8], at: usize) -> Option<(usize, [u8; 4])> {
     Some((u32::from_be_bytes(length.try_into().ok()?) as usize, kind.try_into().ok()?))
 }
 
-/// Takes what a chunk says; of two of a kind the first counts.
+/// Stores the content of a chunk; of two of a type the first counts.
 fn note(kind: &[u8; 4], data: &[u8], found: &mut Metadata) {
     let number = |at: usize| Some(u32::from_be_bytes(data.get(at..at + 4)?.try_into().ok()?));
     match kind {
@@ -68,14 +68,14 @@ fn note(kind: &[u8; 4], data: &[u8], found: &mut Metadata) {
     }
 }
 
-/// After a name and the method of compression.
+/// Inflates an ICC profile, after its name and the compression method.
 fn icc(data: &[u8]) -> Option<Vec<u8>> {
     let name = data.iter().take(80).position(|b| *b == 0)?;
     inflated(data.get(name + 2..)?, LARGEST_ICC)
 }
 
-/// An XMP packet in international text: keyword, whether it is compressed, method, language,
-/// translated keyword.
+/// XMP packet of an international text chunk: keyword, compression flag, method, language,
+/// translated keyword, text.
 fn xmp(data: &[u8]) -> Option<Vec<u8>> {
     let rest = data.strip_prefix(XMP)?.strip_prefix(&[0])?;
     let (flags, rest) = rest.split_at_checked(2)?;
@@ -86,7 +86,7 @@ fn xmp(data: &[u8]) -> Option<Vec<u8>> {
     }
 }
 
-/// `None` where the stream is damaged or holds more than `most` bytes.
+/// Inflates a stream; `None` if it is damaged or has more than `most` bytes.
 fn inflated(data: &[u8], most: usize) -> Option<Vec<u8>> {
     let mut out = Vec::new();
     ZlibDecoder::new(data).take(most as u64 + 1).read_to_end(&mut out).ok()?;

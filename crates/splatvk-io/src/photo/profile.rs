@@ -1,5 +1,5 @@
-//! Colours as the ICC profile of a file means them, to sRGB: phones write Display P3, cameras Adobe
-//! RGB, and photos of both may make one scene. Colours outside sRGB come to lie on its border.
+//! Conversion of colours to sRGB by ICC profiles: phones write Display P3, cameras Adobe RGB, and
+//! one scene may mix them. Colours outside sRGB are clamped to its boundary.
 use crate::files::guarded;
 use image::{DynamicImage, ImageBuffer, Pixel};
 use moxcms::{
@@ -9,17 +9,16 @@ use moxcms::{
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// A profile that moves no colour by more than this is that of sRGB, in steps of 8 bits; tables of
-/// other makers differ by one.
+/// Largest change of a colour by a profile that counts as sRGB, in steps of 8 bits; tables of other
+/// makers differ by one.
 const SAME: u8 = 1;
-/// Levels per channel of the colours by which that is decided.
+/// Levels per channel of the colours in that test.
 const PROBES: [u8; 6] = [0, 51, 102, 153, 204, 255];
-/// Pixels that one thread converts at a time.
+/// Pixels per task of a thread.
 const CHUNK: usize = 1 << 16;
 
-/// The same image in sRGB. A profile that is damaged, or is not one of the image's own channels
-/// (JPEGs with CMYK are RGB by now), leaves it as it is, with a note: metadata must not cost the
-/// photo.
+/// Converts an image to sRGB. A profile that is damaged, or does not fit the image's channels (CMYK
+/// JPEGs are decoded to RGB), changes nothing, with a note: metadata must not cost the photo.
 pub(super) fn to_srgb(image: DynamicImage, icc: &[u8], notes: &mut Vec<String>) -> DynamicImage {
     let Ok(profile) = ColorProfile::new_from_slice(icc) else {
         notes.push("its ICC profile is damaged and not used".to_owned());
@@ -47,8 +46,8 @@ fn is_grey(image: &DynamicImage) -> bool {
     !image.color().has_color()
 }
 
-/// The same image in sRGB by a profile of its channels. Grey of a profile for colours is left as it
-/// is.
+/// Converts an image to sRGB by a profile of its channels; a grey image with a colour profile is
+/// unchanged.
 pub(super) fn by_profile(image: DynamicImage, profile: &ColorProfile) -> DynamicImage {
     if !fits(&image, profile) || is_srgb(profile) {
         return image;
@@ -56,11 +55,11 @@ pub(super) fn by_profile(image: DynamicImage, profile: &ColorProfile) -> Dynamic
     converted(&image, profile).unwrap_or(image)
 }
 
-/// Exponents of PNG that mean the curve of sRGB or of television, which FFmpeg writes as 1 / 1.961.
+/// Exponents of PNG for the curve of sRGB or of television, which FFmpeg writes as 1 / 1.961.
 const SRGB_GAMMA: std::ops::Range<f64> = 0.42..0.53;
 
-/// The image in sRGB by an exponent from light to stored numbers, and x and y of white, red, green
-/// and blue, as PNG states them.
+/// Converts an image to sRGB by an exponent from light to stored numbers, and x and y of white,
+/// red, green and blue, as PNG states them.
 pub(super) fn by_numbers(
     image: DynamicImage,
     gamma: Option<f64>,
@@ -85,7 +84,7 @@ pub(super) fn by_numbers(
     }
 }
 
-/// The same with the curve of a power.
+/// The profile with power functions as its curves.
 pub(super) fn with_gamma(mut profile: ColorProfile, gamma: f32) -> ColorProfile {
     let curve = Some(ToneReprCurve::Parametric(vec![gamma]));
     (profile.red_trc, profile.green_trc, profile.blue_trc) = (curve.clone(), curve.clone(), curve);
@@ -108,7 +107,7 @@ fn converted(image: &DynamicImage, profile: &ColorProfile) -> Option<DynamicImag
         ImageLumaA8(i) => ImageRgba8(by(i, with8(GrayAlpha, Rgba)?)?),
         ImageLuma16(i) => ImageRgb16(by(i, with16(Gray, Rgb)?)?),
         ImageLumaA16(i) => ImageRgba16(by(i, with16(GrayAlpha, Rgba)?)?),
-        // Floating-point files hold linear light by convention, whatever is written beside it.
+        // Floating-point files contain linear light by convention, whatever their metadata state.
         _ => return None,
     })
 }
@@ -116,7 +115,7 @@ fn converted(image: &DynamicImage, profile: &ColorProfile) -> Option<DynamicImag
 type Image<P> = ImageBuffer<P, Vec<<P as Pixel>::Subpixel>>;
 type Transform<T> = Arc<dyn TransformExecutor<T> + Send + Sync>;
 
-/// Every pixel by a transform.
+/// Transforms every pixel.
 fn by<T, P, Q>(image: &Image<P>, transform: Transform<T>) -> Option<Image<Q>>
 where
     T: Copy + Default + Send + Sync,
@@ -126,12 +125,12 @@ where
     let (from, to) = (usize::from(P::CHANNEL_COUNT), usize::from(Q::CHANNEL_COUNT));
     let mut data = vec![T::default(); image.as_raw().len() / from * to];
     let chunks = image.as_raw().par_chunks(CHUNK * from).zip(data.par_chunks_mut(CHUNK * to));
-    // Each on a thread of its own, so each behind the boundary.
+    // Each thread needs a guard of its own.
     chunks.map(|(from, to)| guarded(|| transform.transform(from, to).ok()).ok()?).collect::<Option<()>>()?;
     ImageBuffer::from_raw(image.width(), image.height(), data)
 }
 
-/// Whether a profile changes no colour that anybody could tell.
+/// Whether a profile changes no colour visibly.
 fn is_srgb(profile: &ColorProfile) -> bool {
     let grey = profile.color_space == DataColorSpace::Gray;
     let levels = || PROBES.iter().copied();
@@ -174,7 +173,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn display_p3_and_adobe_rgb_become_srgb() {
+    fn wide_profiles_become_srgb() {
         let made = one(rgb([128, 64, 191]), &display_p3());
         // By the matrices of IEC 61966-2-1 and SMPTE EG 432-1 in double precision.
         let near = |a: [u8; 3], b: [u8; 3]| (0..3).all(|k| a[k].abs_diff(b[k]) <= 1);
@@ -206,7 +205,7 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn srgb_and_what_is_no_profile_change_no_bit() {
+    fn srgb_or_damaged_profile_changes_nothing() {
         let picture: DynamicImage =
             image::RgbImage::from_fn(16, 16, |x, y| image::Rgb([x as u8 * 16, y as u8 * 16, 99])).into();
         let cmyk = {
@@ -224,10 +223,10 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn grey_of_another_gamma_becomes_that_of_srgb() {
+    fn grey_gamma_becomes_srgb() {
         let dark = ColorProfile::new_gray_with_gamma(1.8).encode().unwrap();
         let grey = ImageBuffer::<Luma<u8>, _>::from_pixel(2, 2, Luma([128]));
-        // 0.502 ^ 1.8 is 0.289 of linear light, which sRGB writes as 0.575.
+        // 0.502 ^ 1.8 is 0.289 of linear light, which is 0.575 in sRGB.
         let made = one(grey.into(), &dark);
         assert!(made.iter().all(|v| v.abs_diff(147) <= 1), "{made:?}");
         let with_alpha = ImageBuffer::<LumaA<u8>, _>::from_pixel(2, 2, LumaA([128, 51]));

@@ -1,4 +1,4 @@
-//! One photo from its file.
+//! Reader of one photo.
 use super::border::PlainBorder;
 use super::decode::{self, Decoded};
 use super::kind::stem;
@@ -15,77 +15,78 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Greatest side of a working image on a GPU, pixels: where the reference implementation of
-/// Gaussian splatting stops (Kerbl et al. 2023 scale wider photos down to it). A portrait keeps as
-/// many pixels as the same photo lying on its side.
+/// Longest side of a working image on a GPU, pixels: the limit of the reference implementation of
+/// Gaussian splatting (Kerbl et al. 2023 scale wider photos down to it). A portrait keeps as many
+/// pixels as the same photo in landscape.
 pub const MAX_SIZE: usize = 1600;
 
-/// Greatest side of a working image on a CPU device, pixels: photos of 4:3 then have 1.56 times the
+/// Longest side of a working image on a CPU device, pixels: photos of 4:3 then have 1.56 times the
 /// pixels of 640 × 480, which keeps a run within twice its time (docs/internals/performance.md).
 pub const MAX_SIZE_CPU: usize = 800;
 
-/// The greatest side that suits the device.
+/// Default for the longest side on a device.
 pub fn default_max_size(is_cpu: bool) -> usize {
     if is_cpu { MAX_SIZE_CPU } else { MAX_SIZE }
 }
 
-/// Smallest side of a usable photo, pixels: feature networks work at 1/8 resolution, below 8 × 8
-/// cells nothing is left to match.
+/// Smallest side of a usable photo, pixels: feature networks work at 1/8 resolution, and below 8 ×
+/// 8 cells nothing can be matched.
 pub const SMALLEST_SIDE: usize = 64;
 
 /// One decoded photo at working resolution, upright.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Photo {
-    /// Where it was read from.
+    /// Path of the file.
     pub path: PathBuf,
     /// [`stem`] of the file: the key that joins masks, cameras and renders.
     pub stem: String,
-    /// Upright pixels at working resolution; on a plain border, the nearest pixels of the picture.
+    /// Upright pixels at working resolution; a plain border is filled with the nearest pixels of
+    /// the picture.
     pub image: RgbImage,
-    /// The white or black border that was around the picture, working pixels.
+    /// White or black border around the picture, working pixels.
     pub border: PlainBorder,
     /// Upright size of the file, pixels.
     pub original_size: (u32, u32),
-    /// How the stored pixels of the file were turned to be upright.
+    /// Rotation and mirroring from the stored pixels of the file to upright ones.
     #[serde(default)]
     pub turn: Turn,
     /// Original (upright) pixels → working pixels.
     pub to_working: Affine,
     /// Focal length from EXIF in working pixels, if the file states it.
     pub exif_focal: Option<f64>,
-    /// Luma of the photo at more pixels than the working image has, for measuring positions; where
-    /// there are more.
+    /// Luma of the photo at a higher resolution than the working image, for measuring positions;
+    /// `None` where the file has no more pixels.
     #[serde(skip)]
     pub fine: Option<Arc<Image<f32>>>,
-    /// Pixels of the file whose values are not finite numbers, which are read as black.
+    /// Number of pixels of the file with values that are not finite; they are read as black.
     pub lost_pixels: usize,
-    /// Which pixels are used; `None` = all. Those that are not continue the others smoothly in
-    /// `image`, apart from what hides the scene in every photo.
+    /// Used pixels; `None` = all. In `image`, unused pixels continue the used ones smoothly, except
+    /// under overlays.
     #[serde(default)]
     pub coverage: Option<Coverage>,
-    /// Whether a mask has a part in `coverage`.
+    /// Whether `coverage` includes a mask.
     #[serde(skip)]
     pub masked: bool,
-    /// What of the file is not used, and why: sentences for warnings.
+    /// Notes on parts of the file that are not used, with the reason, for warnings.
     #[serde(skip)]
     pub notes: Vec<String>,
-    /// The lens that was taken out of the image.
+    /// Distortion that was removed from the image.
     pub straightened: Option<Straightening>,
     /// Camera make and model from EXIF: photos that share it may share one focal length.
     pub camera_model: Option<String>,
-    /// Unit vector of gravity in camera axes (x right, y down, z forward), where the phone noted
+    /// Unit vector of gravity in camera axes (x right, y down, z forward), if the phone recorded
     /// it.
     pub gravity: Option<DVec3>,
-    /// Exposure, white balance and vignetting that were taken out of `image`.
+    /// Exposure, white balance and vignetting that were removed from `image`.
     pub light: Light,
-    /// Part of what `coverage` leaves out, while cameras are looked for.
+    /// Pixels excluded from `coverage` during the estimation of cameras.
     #[serde(skip)]
     pub overlay: Option<Overlay>,
 }
 
 impl Photo {
-    /// Takes the lens out of the working image and the fine one; `camera` is the pinhole that
-    /// remains, at the working resolution.
+    /// Undistorts the working image and [`Photo::fine`]; `camera` is the pinhole of the result, at
+    /// the working resolution.
     pub fn straighten(&mut self, lens: Lens, camera: &Camera) {
         if !lens.is_none() {
             let how = Straightening::new(lens, camera);
@@ -98,7 +99,7 @@ impl Photo {
         }
     }
 
-    /// Mirrors the photo as if the file's orientation were without it: its stored pixels turned.
+    /// Mirrors the photo, as if the orientation of the file had no mirroring.
     pub fn unmirror(&mut self) {
         fn flipped<T: Copy>(data: &mut [T], width: usize) {
             data.chunks_exact_mut(width.max(1)).for_each(<[T]>::reverse);
@@ -117,7 +118,7 @@ impl Photo {
         self.turn.mirrored = false;
     }
 
-    /// [`Photo::to_working`] of the mirrored photo: bars that were cut off are on the other side.
+    /// [`Photo::to_working`] of the mirrored photo: cut bars are on the other side.
     pub fn mirrored_to_working(&self) -> Affine {
         let mut map = self.to_working;
         if self.is_cut() {
@@ -127,7 +128,7 @@ impl Photo {
         map
     }
 
-    /// What renders are compared with.
+    /// Target of renders.
     pub fn target(&self) -> RgbImage {
         self.coverage.as_ref().map_or_else(|| self.image.clone(), |c| c.target(&self.image))
     }
@@ -137,7 +138,7 @@ impl Photo {
         self.coverage.as_ref().is_none_or(|c| c.uses(index))
     }
 
-    /// Leaves `hidden` out of [`Photo::coverage`], instead of the overlay that was left out so far.
+    /// Excludes `hidden` from [`Photo::coverage`], in place of the previous overlay.
     pub fn set_overlay(&mut self, hidden: Option<Image<bool>>) {
         let before = match self.overlay.take() {
             Some(overlay) => overlay.before,
@@ -152,7 +153,7 @@ impl Photo {
         }
     }
 
-    /// Cuts off what lies beside the picture, `bars` working pixels on each side.
+    /// Cuts off the bars beside the picture, `bars` working pixels on each side.
     pub fn cut(&mut self, bars: PlainBorder) {
         let (w, h) = (self.image.width, self.image.height);
         self.image = bars.crop(&self.image);
@@ -161,10 +162,10 @@ impl Photo {
             coverage.share = coverage.share.cropped((bars.left, bars.top), (width, height));
         }
         self.fine = self.fine.take().map(|fine| {
-            let to = |n: usize, side: usize, of: usize| (n * side + of / 2) / of;
-            let (x, y) = (to(bars.left, fine.width, w), to(bars.top, fine.height, h));
-            let width = to(self.image.width, fine.width, w).min(fine.width - x);
-            let height = to(self.image.height, fine.height, h).min(fine.height - y);
+            let rescaled = |n: usize, side: usize, of: usize| (n * side + of / 2) / of;
+            let (x, y) = (rescaled(bars.left, fine.width, w), rescaled(bars.top, fine.height, h));
+            let width = rescaled(self.image.width, fine.width, w).min(fine.width - x);
+            let height = rescaled(self.image.height, fine.height, h).min(fine.height - y);
             Arc::new(fine.cropped((x, y), (width, height)))
         });
         let less = |border: usize, bar: usize| border.saturating_sub(bar);
@@ -190,8 +191,8 @@ impl Photo {
         if shown == full { whole } else { [0, 1].map(|k| shown[k] / self.to_working.scale[k]) }
     }
 
-    /// How far the middle of the picture is from that of the file, pixels of the file. Bars may be
-    /// drawn over a photo, or frame a whole one: the optical axis is near one of the two.
+    /// Distance between the centres of the picture and of the file, pixels of the file. Bars may be
+    /// drawn over a photo, or surround a complete one: the principal point is near one of the two.
     pub fn off_middle(&self) -> f64 {
         let middle = [self.image.width, self.image.height].map(|n| 0.5 * n as f64);
         let [x, y] = self.to_working.inverse().apply(middle);
@@ -208,30 +209,30 @@ impl Photo {
         0.5 * (self.to_working.scale[0] + self.to_working.scale[1])
     }
 
-    /// Focal length by EXIF, original pixels.
+    /// Focal length from EXIF, original pixels.
     pub fn original_focal(&self) -> Option<f64> {
         self.exif_focal.map(|f| f / self.to_working.scale[1])
     }
 
-    /// The lens that was taken out of the image.
+    /// Distortion that was removed from the image.
     pub fn lens(&self) -> Lens {
         self.straightened.map_or(Lens::NONE, |s| s.lens)
     }
 
-    /// Where the photo as it was read, at the working resolution, has what the image shows at `p`.
+    /// Position in the distorted photo, at the working resolution, of position `p` in the image.
     pub fn source(&self, p: DVec2) -> DVec2 {
         self.straightened.map_or(p, |s| s.source(p))
     }
 
-    /// The camera of the working image as one of the photo's file: its size, its pixels, its name.
-    /// [`Photo::lens`] belongs to it.
+    /// Camera of the original file for a camera of the working image: with its size, pixels and
+    /// name; distorted by [`Photo::lens`].
     pub fn original_camera(&self, camera: &Camera) -> Camera {
         let name = self.path.file_name().map_or_else(|| self.stem.clone(), |n| n.to_string_lossy().into());
         Camera { name, ..self.to_working.inverse().camera(camera, self.original_size) }
     }
 }
 
-/// [`load_at`] with [`MAX_SIZE`].
+/// Reads a photo by [`load_at`] with [`MAX_SIZE`].
 pub fn load(path: &Path) -> Result<Photo> {
     load_at(path, MAX_SIZE)
 }
@@ -246,12 +247,12 @@ pub(super) fn read(path: &Path) -> Result<Vec<u8>> {
     files::read(path).map_err(|e| Error::input(e.to_string()))
 }
 
-/// [`load_at`] of an image file that is in memory already; `name` stands for its path.
+/// Like [`load_at`], for an image file in memory; `name` stands for its path.
 pub fn from_bytes(name: &Path, bytes: Vec<u8>, max_size: usize) -> Result<Photo> {
     of_decoded(name, decode::decode(bytes, name, None)?, None, max_size)
 }
 
-/// A photo of decoded pixels, of which those count that a mask leaves.
+/// A photo of decoded pixels, with an optional mask.
 pub(super) fn of_decoded(
     name: &Path,
     mut decoded: Decoded,
@@ -284,7 +285,7 @@ pub(super) fn of_decoded(
     Ok(Photo { exif_focal, camera_model, gravity, lost_pixels, turn, notes, ..photo })
 }
 
-/// A photo from upright sRGB pixels in [0, 1]; `focal` is in their pixels, where it is known.
+/// A photo of upright sRGB pixels in [0, 1]; `focal` in these pixels, if known.
 pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>, max_size: usize) -> Result<Photo> {
     if image.data.len() != image.width * image.height {
         return Err(Error::input(format!(
@@ -299,7 +300,7 @@ pub fn from_pixels(name: &Path, image: &RgbImage, focal: Option<f64>, max_size: 
     Ok(Photo { exif_focal: focal.map(|f| f * photo.to_working.scale[1]), ..photo })
 }
 
-/// [`from_pixels`] of which only those are used where `used`, [H, W], is true.
+/// Like [`from_pixels`], with the used pixels `used`, [H, W].
 pub fn from_used_pixels(
     name: &Path,
     image: &RgbImage,
@@ -313,12 +314,12 @@ pub fn from_used_pixels(
     {
         return Err(Error::input(format!("{}: pixels and mask are of two sizes", name.display())));
     }
-    let at = |x: usize, y: usize| (image.at(x, y), if used.at(x, y) { 1.0 } else { 0.0 });
-    let photo = partly_used(name, size, max_size, true, at)?;
+    let pixel = |x: usize, y: usize| (image.at(x, y), if used.at(x, y) { 1.0 } else { 0.0 });
+    let photo = partly_used(name, size, max_size, true, pixel)?;
     Ok(Photo { exif_focal: focal.map(|f| f * photo.to_working.scale[1]), ..photo })
 }
 
-/// Upright pixels at working resolution, nothing known about the lens.
+/// Upright pixels at working resolution, without lens data.
 fn working(
     name: &Path,
     size: (usize, usize),
@@ -334,8 +335,7 @@ fn working(
     Ok(Photo { border, fine, ..bare(name, size, image) })
 }
 
-/// [`working`] of pixels with the share of each that is used: unused ones have no part in the
-/// average of their neighbours.
+/// Like [`working`], for pixels with used shares: unused pixels have no part in the averages.
 fn partly_used(
     name: &Path,
     size: (usize, usize),
@@ -361,7 +361,7 @@ fn partly_used(
     Ok(Photo { coverage, masked, fine, ..bare(name, size, image) })
 }
 
-/// A photo of a working image, with nothing known about its file.
+/// A photo of a working image, without metadata.
 fn bare(name: &Path, (w, h): (usize, usize), image: RgbImage) -> Photo {
     let working = (image.width as u32, image.height as u32);
     Photo {
@@ -396,9 +396,9 @@ pub(super) fn check_size(name: &Path, (w, h): (usize, usize)) -> Result<()> {
     Ok(())
 }
 
-/// Largest long side of [`Photo::fine`], pixels.
+/// Longest side of [`Photo::fine`], pixels.
 const FINE: usize = 3072;
-/// Fewer more pixels than this show nothing new.
+/// Smallest ratio of its width to that of the working image; below, it adds no detail.
 const MIN_GAIN: f64 = 1.25;
 
 fn fine_size((w, h): (usize, usize), working: (usize, usize)) -> Option<(usize, usize)> {
@@ -407,9 +407,9 @@ fn fine_size((w, h): (usize, usize), working: (usize, usize)) -> Option<(usize, 
     (size.0 as f64 > MIN_GAIN * working.0 as f64).then_some(size)
 }
 
-/// Working (width, height) of a photo of that size: the longer side is capped, the other one
-/// rounded. Never larger than the photo, and its shorter side never below [`SMALLEST_SIDE`]: a
-/// panorama keeps what the networks need.
+/// Working (width, height) of a photo: the longer side is capped, the other one rounded. Never
+/// larger than the photo, and the shorter side is never below [`SMALLEST_SIDE`], which networks
+/// need of panoramas.
 pub fn working_size(w: usize, h: usize, max_size: usize) -> (usize, usize) {
     let (long, short) = (w.max(h), w.min(h));
     let floor = (SMALLEST_SIDE * long).div_ceil(short.max(1));

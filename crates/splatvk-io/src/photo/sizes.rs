@@ -1,26 +1,26 @@
-//! Sizes of photos before they are decoded: what memory a run needs, and how many files may be
+//! Sizes of photos before decoding: for estimates of memory, and for the number of files that are
 //! decoded at once.
 use super::candidate::Candidate;
 use super::header;
 use std::ops::Range;
 
-/// Decoded bytes that may be held at once. A photo of 12 megapixels is 36 MB, one of 100 megapixels
-/// 300 MB, and two cores are busy with two of either.
+/// Largest total of decoded bytes at a time. A photo of 12 megapixels is 36 MB, one of 100
+/// megapixels 300 MB, and two cores are busy with two of either.
 const DECODED_AT_ONCE: u64 = 640 << 20;
 
-/// Bytes of a decoded pixel: 8-bit RGB, and as much again that some decoders hold while they work.
+/// Bytes of a decoded pixel: 8-bit RGB, and the same again for buffers of some decoders.
 const DECODED_PIXEL: u64 = 6;
 
-/// Taken for a photo whose size only its decoder finds (HEIC, frames of videos): the 48 megapixels
-/// of today's phones.
+/// Assumed size of a photo whose size only its decoder determines (HEIC, frames of videos): the 48
+/// megapixels of today's phones.
 const ASSUMED: (usize, usize) = (8064, 6048);
 
-/// Upright (width, height) of photos that have not been read yet.
+/// Upright (width, height) of candidates.
 pub fn sizes_of(candidates: &[Candidate]) -> Vec<(usize, usize)> {
     candidates.iter().map(|c| header::upright_size(&c.path).unwrap_or(ASSUMED)).collect()
 }
 
-/// Consecutive photos that may be decoded side by side.
+/// Ranges of consecutive photos to decode in parallel.
 pub(super) fn waves(candidates: &[Candidate]) -> Vec<Range<usize>> {
     let bytes: Vec<u64> = sizes_of(candidates).iter().map(|(w, h)| (w * h) as u64 * DECODED_PIXEL).collect();
     grouped(&bytes)
@@ -50,7 +50,7 @@ mod tests {
     use image::ImageEncoder;
 
     #[test]
-    fn small_photos_are_decoded_together_and_large_ones_alone() {
+    fn waves_bound_decoded_bytes() {
         let mp = |n: u64| n * 1_000_000 * DECODED_PIXEL;
         assert_eq!(grouped(&[mp(12), mp(12), mp(100)]), [0..2, 2..3]);
         assert_eq!(grouped(&[mp(100); 3]), [0..1, 1..2, 2..3]);
@@ -59,12 +59,12 @@ mod tests {
     }
 
     #[test]
-    fn headers_tell_the_upright_size() {
+    fn sizes_of_reads_upright_headers() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("wide.png");
         image::RgbImage::new(300, 40).save(&path).unwrap();
         std::fs::write(folder.path().join("none.png"), b"no image").unwrap();
-        // Stored lying on its side, as phones do.
+        // Stored on its side, as phones do.
         let tall = folder.path().join("tall.png");
         let mut encoder = image::codecs::png::PngEncoder::new(std::fs::File::create(&tall).unwrap());
         encoder.set_exif_metadata(block(&[(Tag::Orientation, Value::Short(vec![6]))])).unwrap();

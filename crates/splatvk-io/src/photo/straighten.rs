@@ -1,14 +1,14 @@
-//! Photos resampled to a pinhole without distortion.
+//! Undistortion: resampling of photos to a pinhole.
 use crate::scene::{Camera, Image, Lens, RgbImage};
 use glam::DVec2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// A lens and the pinhole that remains when it is taken out of a picture: same size, focal length
-/// and principal point.
+/// Distortion and the pinhole of the undistorted picture: same size, focal length and principal
+/// point.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Straightening {
-    /// What is taken out.
+    /// Distortion to remove.
     pub lens: Lens,
     /// Focal length along x, pixels.
     pub focal: f64,
@@ -19,52 +19,52 @@ pub struct Straightening {
     pub centre: DVec2,
 }
 
-/// Scenes of earlier versions do not state it.
+/// Default for scenes of earlier versions.
 fn square() -> f64 {
     1.0
 }
 
 impl Straightening {
-    /// Of a picture whose pinhole is `camera`.
+    /// Undistortion of a picture to the pinhole `camera`.
     pub fn new(lens: Lens, camera: &Camera) -> Straightening {
         let centre = DVec2::new(camera.cx, camera.cy);
         Straightening { lens, focal: camera.fx, aspect: camera.fy / camera.fx, centre }
     }
 
-    /// Where the lens imaged what the pinhole shows at `p`, pixels.
+    /// Distorted position of position `p` in the undistorted picture, pixels.
     pub fn source(&self, p: DVec2) -> DVec2 {
         let focal = DVec2::new(self.focal, self.focal * self.aspect);
         self.lens.distort((p - self.centre) / focal) * focal + self.centre
     }
 
-    /// The same for the picture in another size.
+    /// Undistortion of the picture at another size.
     fn resized(&self, scale: f64) -> Straightening {
         Straightening { focal: self.focal * scale, centre: self.centre * scale, ..*self }
     }
 
-    /// The picture without the lens, by cubic interpolation (Catmull–Rom); what the lens did not
-    /// see continues the nearest pixels.
+    /// The undistorted picture, by cubic interpolation (Catmull–Rom); positions outside the photo
+    /// take the nearest pixels.
     pub fn image(&self, image: &RgbImage) -> RgbImage {
         let size = (image.width, image.height);
         let data = resampled(size, |x, y| image.at(x, y), |p| self.source(p));
         RgbImage { width: size.0, height: size.1, data }
     }
 
-    /// [`Straightening::image`] of one channel.
+    /// Like [`Straightening::image`], for one channel.
     pub fn plane(&self, plane: &Image<f32>) -> Image<f32> {
         let size = (plane.width, plane.height);
         let data = resampled(size, |x, y| [plane.at(x, y)], |p| self.source(p));
         Image { width: size.0, height: size.1, data: data.into_iter().map(|[v]| v).collect() }
     }
 
-    /// [`Straightening::plane`] of a picture that is larger than the one that is meant, which is
-    /// `width` pixels wide.
+    /// Like [`Straightening::plane`], for a larger version of the picture, whose own width is
+    /// `width`.
     pub(super) fn larger(&self, plane: &Image<f32>, width: usize) -> Image<f32> {
         self.resized(plane.width as f64 / width as f64).plane(plane)
     }
 }
 
-/// An image whose pixel at `p` shows what stands at `source(p)`.
+/// An image whose pixel at `p` is sampled at `source(p)`.
 fn resampled<const N: usize>(
     (w, h): (usize, usize),
     at: impl Fn(usize, usize) -> [f32; N] + Sync,
@@ -90,8 +90,8 @@ fn weights(t: f32) -> [f32; 4] {
     ]
 }
 
-/// Value at a continuous position; within the range of the four nearest pixels, so that edges do
-/// not ring.
+/// Value at a continuous position, clamped to the range of the four nearest pixels, so that edges
+/// do not ring.
 fn cubic<const N: usize>(
     (w, h): (usize, usize),
     at: &impl Fn(usize, usize) -> [f32; N],
@@ -123,10 +123,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_pattern_seen_through_a_lens_comes_out_straight() {
+    fn straightening_restores_distorted_pattern() {
         let (w, h, focal, lens) = (160, 120, 140.0, Lens::radial(-0.12, 0.03));
         let centre = DVec2::new(81.0, 58.5);
-        // A smooth pattern of ideal positions, and the photo that the lens makes of it.
+        // A smooth pattern of ideal positions, and its distorted photo.
         let pattern = |x: DVec2| {
             let (u, v) = (x.x * focal, x.y * focal);
             [(0.15 * u).sin() as f32, (0.12 * v).sin() as f32, (0.08 * (u + v)).cos() as f32]

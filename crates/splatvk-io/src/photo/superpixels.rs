@@ -26,7 +26,7 @@ impl Forest {
 
 /// Merges pixels along edges of rising weight while the edge is no heavier than both sides'
 /// internal difference plus `scale / size`; regions below `min_size` then join their most similar
-/// neighbour. Returns compact labels.
+/// neighbour. Returns compact labels and their number.
 ///
 /// `weight(p, q)` is the dissimilarity of two neighbouring pixels (8-neighbourhood).
 pub fn superpixels(

@@ -1,16 +1,16 @@
-//! Which kinds of files this machine can read.
+//! Support of this machine for kinds of files.
 
-/// What the machine has for a kind of files.
+/// Support for a kind of files.
 #[derive(Clone, Debug)]
 pub struct Support {
-    /// What is there, in words.
+    /// Description of the available parts.
     pub found: String,
-    /// What to do about what is missing.
+    /// Advice for missing parts.
     pub advice: Option<String>,
 }
 
 impl Support {
-    /// Nothing is there.
+    /// No support.
     pub(super) fn none(what: &str, advice: String) -> Support {
         Support { found: what.to_owned(), advice: Some(advice) }
     }

@@ -1,7 +1,7 @@
 //! Tags of TIFF files and EXIF blocks, each value within a bound: counts and offsets come from the
-//! file, and a thousand tags may name the same bytes.
+//! file, and a thousand tags may share the same bytes.
 
-/// Largest value that is read, bytes: what a tag of a JPEG can have.
+/// Largest value that is read, bytes: the largest value in a JPEG.
 const LARGEST_VALUE: usize = 64 << 10;
 
 /// Tags of the first directory that [`digest`] keeps: kind and channels of the image, make, model,
@@ -10,7 +10,8 @@ const FIRST: [u16; 8] = [0xfe, 0x106, 0x10f, 0x110, 0x112, 0x14a, 0x152, 0xc612]
 /// Tags of the EXIF directory that it keeps: lens, sensor, size, colour space, processing, the
 /// maker's note.
 const EXIF: [u16; 10] = [0x920a, 0x927c, 0xa001, 0xa002, 0xa003, 0xa20e, 0xa210, 0xa401, 0xa405, 0xa434];
-/// Where the first directory leads to the EXIF one, and that to the one of interoperability.
+/// Tag of the first directory with the offset of the EXIF one, and tag of that with the offset of
+/// the interoperability directory.
 const TO_EXIF: u16 = 0x8769;
 const TO_INTEROPERABILITY: u16 = 0xa005;
 /// InteroperabilityIndex.
@@ -30,7 +31,7 @@ struct Entry<'a> {
 /// Bytes per value of the types 1 to 13.
 const SIZES: [usize; 14] = [0, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4];
 
-/// The directories of a file or block; neither copied nor bounded yet.
+/// Directories of a file or block, borrowed from it.
 pub(super) struct Directories<'a> {
     big_endian: bool,
     first: Vec<Entry<'a>>,
@@ -60,8 +61,7 @@ impl Order {
         if self.0 { v.to_be_bytes() } else { v.to_le_bytes() }
     }
 
-    /// The entries of the directory at an offset; those that do not lie within the bytes are left
-    /// out.
+    /// Entries of the directory at an offset; those outside of the bytes are left out.
     fn directory(self, bytes: &[u8], at: usize) -> Vec<Entry<'_>> {
         let count = self.short(bytes, at).unwrap_or(0);
         let entry = |k: usize| {
@@ -75,14 +75,14 @@ impl Order {
         (0..usize::from(count)).filter_map(entry).collect()
     }
 
-    fn led_to<'a>(self, bytes: &'a [u8], from: &[Entry], tag: u16) -> Vec<Entry<'a>> {
+    fn subdirectory<'a>(self, bytes: &'a [u8], from: &[Entry], tag: u16) -> Vec<Entry<'a>> {
         let at = from.iter().find(|e| e.tag == tag).and_then(|e| self.long(e.value, 0));
         at.map(|at| self.directory(bytes, at as usize)).unwrap_or_default()
     }
 }
 
 impl<'a> Directories<'a> {
-    /// `None` where the bytes do not begin as TIFF.
+    /// Parses the directories; `None` without a TIFF header.
     pub fn of(bytes: &'a [u8]) -> Option<Directories<'a>> {
         let big_endian = match bytes.get(..4)? {
             b"II*\0" => false,
@@ -91,17 +91,17 @@ impl<'a> Directories<'a> {
         };
         let order = Order(big_endian);
         let first = order.directory(bytes, order.long(bytes, 4)? as usize);
-        let exif = order.led_to(bytes, &first, TO_EXIF);
-        let interoperability = order.led_to(bytes, &exif, TO_INTEROPERABILITY);
+        let exif = order.subdirectory(bytes, &first, TO_EXIF);
+        let interoperability = order.subdirectory(bytes, &exif, TO_INTEROPERABILITY);
         Some(Directories { big_endian, first, exif, interoperability })
     }
 
-    /// The bytes of a value of the first directory.
+    /// Bytes of a value of the first directory.
     pub fn bytes(&self, tag: u16) -> Option<&'a [u8]> {
         self.first.iter().find(|e| e.tag == tag).map(|e| e.value)
     }
 
-    /// DCF: "R03" stands for Adobe RGB in files without an ICC profile.
+    /// DCF: "R03" means Adobe RGB in files without an ICC profile.
     pub fn is_adobe_rgb(&self) -> bool {
         self.interoperability.iter().any(|e| e.tag == INDEX && e.value.starts_with(b"R03"))
     }
@@ -112,7 +112,7 @@ impl<'a> Directories<'a> {
         extra.and_then(|v| Order(self.big_endian).short(v, 0)) == Some(1)
     }
 
-    /// A TIFF block of the tags that are used, each once and with at most [`LARGEST_VALUE`] bytes.
+    /// A TIFF block of the needed tags, each once and with at most [`LARGEST_VALUE`] bytes.
     pub fn digest(&self) -> Vec<u8> {
         let order = Order(self.big_endian);
         let (first, exif) = (chosen(&self.first, &FIRST), chosen(&self.exif, &EXIF));
@@ -147,10 +147,10 @@ impl<'a> Directories<'a> {
     }
 }
 
-/// The wanted ones that are not too large.
+/// The wanted entries of at most [`LARGEST_VALUE`] bytes, in the order of `wanted`.
 fn chosen<'e>(entries: &'e [Entry<'e>], wanted: &[u16]) -> Vec<&'e Entry<'e>> {
-    let one = |tag: &u16| entries.iter().find(|e| e.tag == *tag && e.value.len() <= LARGEST_VALUE);
-    wanted.iter().filter_map(one).collect()
+    let find = |tag: &u16| entries.iter().find(|e| e.tag == *tag && e.value.len() <= LARGEST_VALUE);
+    wanted.iter().filter_map(find).collect()
 }
 
 #[cfg(test)]
@@ -158,8 +158,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn thousand_tags_of_same_bytes_are_few() {
-        // 60,000 tags that all name the same megabyte.
+    fn tiff_digest_is_bounded() {
+        // 60,000 tags that share the same megabyte.
         let (tags, size) = (60_000u32, 1u32 << 20);
         let mut bytes = b"II*\0\x08\0\0\0".to_vec();
         bytes.extend((tags as u16).to_le_bytes());

@@ -1,13 +1,13 @@
-//! How the stored pixels of a file lie in the upright photo.
+//! Orientation of the stored pixels of a file.
 use image::metadata::Orientation;
 use serde::{Deserialize, Serialize};
 
-/// The EXIF orientation of a file: its stored pixels are turned, then mirrored, to be upright.
+/// EXIF orientation of a file: its stored pixels are rotated, then mirrored, to be upright.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Turn {
-    /// Quarters of a turn clockwise, 0 to 3.
+    /// Quarter turns clockwise, 0 to 3.
     pub quarters: u8,
-    /// Whether left and right change places after that.
+    /// Whether the rotated pixels are mirrored horizontally.
     pub mirrored: bool,
 }
 
@@ -28,17 +28,17 @@ impl From<Orientation> for Turn {
 }
 
 impl Turn {
-    /// Whether the stored pixels are the upright ones.
+    /// Whether the stored pixels are upright.
     pub fn is_none(self) -> bool {
         self == Turn::default()
     }
 
-    /// (width, height) of the stored picture where the upright one has `size`.
+    /// (width, height) of the stored picture for an upright one of `size`.
     pub fn stored(self, (w, h): (u32, u32)) -> (u32, u32) {
         if self.quarters % 2 == 1 { (h, w) } else { (w, h) }
     }
 
-    /// The number of the EXIF tag, 1 to 8.
+    /// Value of the EXIF tag, 1 to 8.
     pub fn exif(self) -> u8 {
         match (self.quarters % 4, self.mirrored) {
             (0, false) => 1,
@@ -62,8 +62,8 @@ mod tests {
         for tag in 1..=8u8 {
             let turn = Turn::from(Orientation::from_exif(tag).unwrap());
             assert_eq!((turn.exif(), turn.stored((4, 3)) == (3, 4)), (tag, tag > 4));
-            // The picture of two by one pixels, turned and mirrored as the type says, is what the
-            // tag means.
+            // The stored picture, rotated and mirrored as the type states, equals the tag's
+            // definition.
             let stored = image::RgbImage::from_fn(3, 2, |x, y| image::Rgb([x as u8, y as u8, 0]));
             let mut upright = image::DynamicImage::from(stored.clone());
             upright.apply_orientation(Orientation::from_exif(tag).unwrap());

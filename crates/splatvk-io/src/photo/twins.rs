@@ -6,8 +6,8 @@ use std::cmp::Reverse;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-/// Keeps one file of each photo: of those of one folder and one stem the one with most pixels, of
-/// equals the JPEG. Returns the others behind those that are kept.
+/// Keeps one file of each photo: of those with the same folder and stem the one with most pixels,
+/// on a tie the JPEG. Returns pairs of the kept file and a removed one.
 pub(super) fn leave_out(photos: &mut Vec<PathBuf>) -> Vec<(PathBuf, PathBuf)> {
     let mut groups: BTreeMap<(Option<PathBuf>, String), Vec<PathBuf>> = BTreeMap::new();
     for photo in photos.iter().filter(|p| is_camera_format(p)) {
@@ -30,22 +30,28 @@ mod tests {
     use super::super::choose::find;
 
     #[test]
-    fn photos_in_two_formats_are_found_once() {
+    fn photos_in_two_formats_count_once() {
         let folder = tempfile::tempdir().unwrap();
-        let at = |name: &str| folder.path().join(name);
+        let path_of = |name: &str| folder.path().join(name);
         let data = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data");
         for k in 0..2 {
-            std::fs::copy(data.join(format!("breakfast/images/train_0{k}.jpg")), at(&format!("IMG_{k}.JPG")))
-                .unwrap();
+            std::fs::copy(
+                data.join(format!("breakfast/images/train_0{k}.jpg")),
+                path_of(&format!("IMG_{k}.JPG")),
+            )
+            .unwrap();
         }
-        // Smaller than the JPEG, larger, as large, and one that is no photo.
-        std::fs::copy(data.join("photos/turned.heic"), at("IMG_0.HEIC")).unwrap();
-        image::RgbImage::new(1280, 960).save(at("IMG_1.tif")).unwrap();
-        std::fs::write(at("IMG_0.CR2"), "raw").unwrap();
-        std::fs::write(at("IMG_9.NEF"), "raw").unwrap();
+        // Smaller than the JPEG, larger, a raw file, and a raw file without a photo.
+        std::fs::copy(data.join("photos/turned.heic"), path_of("IMG_0.HEIC")).unwrap();
+        image::RgbImage::new(1280, 960).save(path_of("IMG_1.tif")).unwrap();
+        std::fs::write(path_of("IMG_0.CR2"), "raw").unwrap();
+        std::fs::write(path_of("IMG_9.NEF"), "raw").unwrap();
         let found = find(&[folder.path().to_path_buf()]).unwrap();
-        assert_eq!(found.photos, [at("IMG_0.JPG"), at("IMG_1.tif")]);
-        assert_eq!(found.twins, [(at("IMG_0.JPG"), at("IMG_0.HEIC")), (at("IMG_1.tif"), at("IMG_1.JPG"))]);
+        assert_eq!(found.photos, [path_of("IMG_0.JPG"), path_of("IMG_1.tif")]);
+        assert_eq!(
+            found.twins,
+            [(path_of("IMG_0.JPG"), path_of("IMG_0.HEIC")), (path_of("IMG_1.tif"), path_of("IMG_1.JPG"))]
+        );
         let warnings = found.warnings().join("; ");
         for words in ["IMG_0.JPG for IMG_0.HEIC", "IMG_9.NEF; develop", "the photos beside them are: "] {
             assert!(warnings.contains(words), "{warnings}");

@@ -11,21 +11,21 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-/// Frames looked at: one per second of a minute's walk around a thing, and 60 × 60 pairs are
-/// compared in seconds.
+/// Largest number of candidate frames: one per second of a minute's walk around a thing; 60 × 60
+/// pairs are compared in seconds.
 const CANDIDATES: u64 = 60;
 
-/// One frame of 8K HEVC between two key frames ten seconds apart decodes in half of this on two
-/// cores.
+/// Time limit for a frame: one frame of 8K HEVC between two key frames ten seconds apart decodes in
+/// half of this on two cores.
 const LONGEST: Duration = Duration::from_secs(120);
 
 /// Largest frame, pixels: beyond 8K.
 const MAX_PIXELS: u64 = 64 << 20;
 
-/// Containers that cameras and phones write. Playlists are not among them: they name other files.
+/// Containers of cameras and phones. Playlists are excluded: they name other files.
 const CONTAINERS: &str = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,asf";
 
-/// What to do without the programs.
+/// Advice where the programs are missing.
 const INSTALL: &str =
     "install it (tools/setup; apt-get install ffmpeg; brew install ffmpeg), or give still photos";
 
@@ -35,19 +35,14 @@ pub(super) struct Video {
     pub path: PathBuf,
     /// Seconds.
     duration: f64,
-    /// As many as the file states, or as its rate suggests.
+    /// Number of frames that the file states, or that follows from its rate.
     frames: u64,
-    /// How its numbers become colours.
+    /// Meaning of its colour values.
     pub code_points: CodePoints,
 }
 
-/// "ffmpeg 5.1.9", or what is missing and what to do: `(found, advice)`.
+/// Support for videos: "ffmpeg 5.1.9", or the missing part with advice.
 pub(super) fn status() -> Support {
-    let version = |program: &str| {
-        let output = Command::new(program).arg("-version").stdin(Stdio::null()).output().ok()?;
-        let text = String::from_utf8_lossy(&output.stdout).into_owned();
-        output.status.success().then(|| text.split_whitespace().nth(2).unwrap_or("").to_owned())
-    };
     match (version("ffmpeg"), version("ffprobe")) {
         (Some(version), Some(_)) => Support { found: format!("ffmpeg {version}"), advice: None },
         (None, _) => Support::none("videos cannot be read", format!("ffmpeg is not there; {INSTALL}")),
@@ -55,8 +50,16 @@ pub(super) fn status() -> Support {
     }
 }
 
+/// Version of an installed program.
+fn version(program: &str) -> Option<String> {
+    let output = Command::new(program).arg("-version").stdin(Stdio::null()).output().ok()?;
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    output.status.success().then(|| text.split_whitespace().nth(2).unwrap_or("").to_owned())
+}
+
 impl Video {
-    /// Reads length and size.
+    /// Reads duration, number of frames and code points; refuses files without a usable video
+    /// stream.
     pub fn open(path: &Path, progress: &dyn Progress) -> Result<Video> {
         let entries = "stream=width,height,avg_frame_rate,nb_frames,duration,color_transfer,color_primaries:\
             stream_side_data=side_data_type,projection:format=duration";
@@ -101,24 +104,24 @@ impl Video {
         Ok(Video { path: path.to_path_buf(), duration, frames, code_points })
     }
 
-    /// When the candidate frames are, seconds: evenly from the first frame on.
+    /// Times of the candidate frames, seconds: evenly spaced from the first frame on.
     pub fn times(&self) -> Vec<f64> {
         let count = self.frames.min(CANDIDATES);
         (0..count).map(|i| self.duration * i as f64 / count as f64).collect()
     }
 
-    /// `clip.mp4/clip_0012400` for the frame at 12.4 s. Without dots: what follows one would pass
-    /// for an extension.
+    /// `clip.mp4/clip_0012400` for the frame at 12.4 s. Without dots: the text after one would
+    /// count as an extension.
     pub fn frame_name(&self, at: f64) -> PathBuf {
         let stem = self.path.file_stem().map(|s| s.to_string_lossy().replace('.', "_")).unwrap_or_default();
         self.path.join(format!("{stem}_{:07}", (at * 1000.0).round() as u64))
     }
 
-    /// The frame at a time, upright, as PNG bytes; at most `side` pixels long where that is given.
-    /// Empty past the end.
+    /// The frame at a time, upright, as PNG bytes; scaled to at most `side` pixels if given. Empty
+    /// past the end.
     pub fn frame(&self, at: f64, side: Option<usize>, progress: &dyn Progress) -> Result<Vec<u8>> {
         let mut command = reader("ffmpeg");
-        // 1 GiB at once: four times what a frame of the largest size takes in 16 bit.
+        // 1 GiB at once: four times a frame of the largest size in 16 bit.
         command.args(["-nostdin", "-max_alloc", "1073741824", "-threads", "2"]);
         command.args(["-ss", &format!("{at:.6}"), "-i"]).arg(file(&self.path));
         command.args(["-map", "0:v:0", "-frames:v", "1"]);
@@ -126,7 +129,7 @@ impl Video {
             let fit = format!("scale='min({side},iw)':'min({side},ih)':flags=area");
             command.args(["-vf", &format!("{fit}:force_original_aspect_ratio=decrease")]);
         }
-        // 8 bits of a high dynamic range would show steps.
+        // High dynamic range in 8 bits would show banding.
         let (format, bytes) =
             if code_points::is_hdr(self.code_points) { ("rgb48be", 6) } else { ("rgb24", 3) };
         command.args(["-c:v", "png", "-pix_fmt", format, "-f", "image2pipe", "pipe:1"]);
@@ -135,8 +138,8 @@ impl Video {
     }
 }
 
-/// The numbers of ITU-T H.273 for what ffprobe calls primaries and transfer; a name that is not
-/// known is said.
+/// Code points of ITU-T H.273 for the names of primaries and transfer in ffprobe; warns of unknown
+/// names.
 fn code_points(stream: &serde_json::Value, path: &Path, progress: &dyn Progress) -> CodePoints {
     let number = |key: &str, of: fn(&str) -> Option<u16>, what: &str| {
         let name = stream[key].as_str().unwrap_or("");
@@ -152,7 +155,7 @@ fn code_points(stream: &serde_json::Value, path: &Path, progress: &dyn Progress)
     [number("color_primaries", code_points::primaries_of_name, "primaries"), transfer, 0, 1]
 }
 
-/// The options that both programs share. Options of the input come before it.
+/// Common options of both programs. Options of the input precede it.
 fn reader(program: &str) -> Command {
     let mut command = Command::new(program);
     command.args(["-hide_banner", "-loglevel", "error"]);
@@ -161,14 +164,14 @@ fn reader(program: &str) -> Command {
     command
 }
 
-/// The path as an address: nothing in a name can be taken for an option or another protocol.
+/// The path as a URL: no file name can be read as an option or another protocol.
 fn file(path: &Path) -> OsString {
     let mut address = OsString::from("file:");
     address.push(path);
     address
 }
 
-/// Kills and reaps the program when it is dropped before its end.
+/// Kills and reaps the program when dropped before its end.
 struct Running(Child);
 
 impl Drop for Running {
@@ -177,6 +180,16 @@ impl Drop for Running {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
+}
+
+/// Reads at most `most` bytes of a pipe on a thread.
+fn collect(pipe: Option<Box<dyn Read + Send>>, most: u64) -> std::thread::JoinHandle<Vec<u8>> {
+    std::thread::spawn(move || {
+        let mut bytes = Vec::new();
+        // Output before an error is more useful than the error.
+        let _ = pipe.map(|p| p.take(most).read_to_end(&mut bytes));
+        bytes
+    })
 }
 
 /// Standard output of a program that reads `path`, at most `most` bytes.
@@ -190,14 +203,6 @@ fn output(mut command: Command, path: &Path, most: u64, progress: &dyn Progress)
         _ => Error::work(named(format!("{program} does not start ({})", words(&e)))),
     })?;
     let mut child = Running(child);
-    let collect = |pipe: Option<Box<dyn Read + Send>>, most: u64| {
-        std::thread::spawn(move || {
-            let mut bytes = Vec::new();
-            // What was read before an error tells more than the error.
-            let _ = pipe.map(|p| p.take(most).read_to_end(&mut bytes));
-            bytes
-        })
-    };
     let out = collect(child.0.stdout.take().map(|p| Box::new(p) as _), most + 1);
     // Enough for the first messages.
     let errors = collect(child.0.stderr.take().map(|p| Box::new(p) as _), 4096);
@@ -219,13 +224,13 @@ fn output(mut command: Command, path: &Path, most: u64, progress: &dyn Progress)
     };
     let (bytes, errors) = (out.join().unwrap_or_default(), errors.join().unwrap_or_default());
     if !status.success() || bytes.len() as u64 > most {
-        let said = String::from_utf8_lossy(&errors).replace(&*path.to_string_lossy(), "");
-        let said = said.split_whitespace().collect::<Vec<_>>().join(" ");
-        // Messages may be long; the first sentence or two say it.
-        let said: String =
-            said.trim_start_matches("file:").trim_matches([':', ' ']).chars().take(160).collect();
+        let message = String::from_utf8_lossy(&errors).replace(&*path.to_string_lossy(), "");
+        let message = message.split_whitespace().collect::<Vec<_>>().join(" ");
+        // Messages may be long; the first sentence or two suffice.
+        let message: String =
+            message.trim_start_matches("file:").trim_matches([':', ' ']).chars().take(160).collect();
         return Err(Error::input(named(format!(
-            "the video cannot be read ({said}); copy it again, or save it as MP4"
+            "the video cannot be read ({message}); copy it again, or save it as MP4"
         ))));
     }
     Ok(bytes)

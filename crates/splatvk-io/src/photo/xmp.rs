@@ -1,27 +1,27 @@
-//! Panoramas by the XMP packet of a photo: no pinhole shows them.
+//! Detection of panoramas by the XMP packet of a photo; they do not fit a pinhole camera.
 use std::path::Path;
 
 /// Namespace of panoramas (developers.google.com/streetview/spherical-metadata).
 const NAMESPACE: &str = "http://ns.google.com/photos/1.0/panorama/";
 
-/// What says that the photo is a panorama, as "GPano:ProjectionType=equirectangular"; `None` for
+/// Evidence that the photo is a panorama, as "GPano:ProjectionType=equirectangular"; `None` for
 /// photos of a pinhole.
 pub(super) fn panorama(packet: &[u8]) -> Option<String> {
     let text = String::from_utf8_lossy(packet);
     let declared = text.find(NAMESPACE)?;
-    // xmlns:GPano="http://…": the prefix is the file's own choice.
+    // xmlns:GPano="http://…": files may choose the prefix.
     let prefix = text[..declared].trim_end_matches(['"', '\'', '=', ' ']).rsplit(':').next()?;
     let value = |name: &str| property(&text, &format!("{prefix}:{name}"));
     let projection = value("ProjectionType");
     match projection.as_deref() {
         Some("rectilinear" | "perspective") => None,
         Some(other) => Some(format!("GPano:ProjectionType={}", other.chars().take(40).collect::<String>())),
-        // The type is equirectangular unless it is stated.
+        // The type defaults to equirectangular.
         None => value("FullPanoWidthPixels").map(|width| format!("GPano:FullPanoWidthPixels={width}")),
     }
 }
 
-/// The value of a property, as attribute or as element.
+/// Value of a property, as attribute or as element.
 fn property(text: &str, name: &str) -> Option<String> {
     text.match_indices(name).find_map(|(at, _)| {
         let rest = text[at + name.len()..].trim_start();
@@ -38,10 +38,10 @@ fn property(text: &str, name: &str) -> Option<String> {
     })
 }
 
-/// The refusal of a panorama, without the file's name in front.
+/// Text of the refusal of a panorama, without the file's name in front.
 pub(super) fn refusal(what: &str, path: &Path) -> String {
     let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    // As a shell takes it for one word.
+    // Quotes a word for a shell.
     let quoted = |name: &str| format!("'{}'", name.replace('\'', "'\\''"));
     if !what.contains("equirectangular") && !what.contains("Full") {
         return format!(
@@ -61,7 +61,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn panoramas_are_told_by_xmp() {
+    fn panorama_is_detected_by_xmp() {
         let packet = |prefix: &str, inside: &str| {
             format!("<x:xmpmeta><rdf:Description xmlns:{prefix}=\"{NAMESPACE}\" {inside}</x:xmpmeta>")
                 .into_bytes()

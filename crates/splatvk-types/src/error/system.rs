@@ -1,8 +1,8 @@
-//! What the operating system says, in words: its own text ends in a number, and names things as its
-//! programmers do.
+//! Errors of the operating system in plain words: the system's own text ends in a number and uses
+//! terms of programmers.
 use std::io;
 
-/// The error in words that follow the name of a file: "does not exist".
+/// Text of an error that follows the name of a file: "does not exist".
 pub fn words(e: &io::Error) -> String {
     use io::ErrorKind as K;
     let known = match e.kind() {
@@ -28,7 +28,7 @@ pub fn words(e: &io::Error) -> String {
     known.to_owned()
 }
 
-/// Advice behind a semicolon; empty where only the cause determines it.
+/// Advice after a semicolon; empty where the kind of the error implies none.
 pub(super) fn advice(e: &io::Error) -> &'static str {
     use io::ErrorKind as K;
     match e.kind() {
@@ -53,7 +53,7 @@ const TOO_MANY_IN_SYSTEM: i32 = 23;
 const INPUT_OUTPUT: i32 = 5;
 const LINK_CIRCLE: i32 = if cfg!(target_os = "linux") { 40 } else { 62 };
 
-/// The text of the system without its number: "Broken pipe (os error 32)".
+/// Text of the system without its number: "Broken pipe (os error 32)".
 fn bare(text: &str) -> String {
     let end = text.find(" (os error ").unwrap_or(text.len());
     let mut letters = text[..end].chars();
@@ -72,7 +72,7 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn system_errors_have_words_and_no_number() {
+    fn system_error_text_has_no_number() {
         // EPERM, ENOENT, EIO, EACCES, ENOTDIR, EISDIR, ENFILE, EMFILE, EFBIG, ENOSPC, EROFS, EPIPE,
         // ENAMETOOLONG, ELOOP, EADDRINUSE, EDQUOT.
         for number in [1, 2, 5, 13, 20, 21, 23, 24, 27, 28, 30, 32, 36, 40, 98, 122] {

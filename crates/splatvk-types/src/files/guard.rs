@@ -1,5 +1,5 @@
-//! Decoders of other crates over bytes from outside. A file must not end the program, so that a
-//! panic of a decoder counts as damage of the file, and says nothing on stderr.
+//! Guard around decoders of other crates for untrusted bytes. A panic of a decoder counts as damage
+//! of the file: it does not end the program and prints nothing to stderr.
 use std::any::Any;
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
@@ -10,7 +10,7 @@ thread_local! {
     static QUIET: Cell<bool> = const { Cell::new(false) };
 }
 
-/// Sets [`QUIET`] and puts it back, also while a panic unwinds.
+/// Sets [`QUIET`] and restores it on drop, also while a panic unwinds.
 struct Quiet(bool);
 
 impl Quiet {
@@ -25,16 +25,16 @@ impl Drop for Quiet {
     }
 }
 
-/// Longest text of a panic in a message, characters.
+/// Longest panic text in a message, characters.
 const LONGEST: usize = 120;
 
-/// Runs a decoder on this thread; `Err` holds the text of its panic, one line. What it leaves
-/// half-done must not be used again.
+/// Runs a decoder on this thread; `Err` holds the text of its panic, one line. State that the
+/// decoder left half-changed must not be used again.
 pub fn guarded<T>(decode: impl FnOnce() -> T) -> Result<T, String> {
     static HOOK: Once = Once::new();
     HOOK.call_once(|| {
         let before = take_hook();
-        // A thread that ends has no flag any more.
+        // The flag of an ending thread is already destroyed.
         set_hook(Box::new(move |panic| match QUIET.try_with(Cell::get) {
             Ok(true) => {}
             _ => before(panic),

@@ -3,9 +3,9 @@ use crate::{Error, Result};
 use std::path::PathBuf;
 
 /// The folder that set-up fills: `SPLATVK_HOME`, else `splatvk` in the user's data folder
-/// (`XDG_DATA_HOME`, else `.local/share` in `HOME`, else in the home that the system knows). Code
-/// is loaded from there, so a relative `XDG_DATA_HOME` or `HOME`, which would mean the current
-/// folder, does not count; where nothing else is left, that is [`Error::Missing`].
+/// (`XDG_DATA_HOME`, else `.local/share` in `HOME`, else in the home directory of the system's user
+/// database). Code is loaded from there, so a relative `XDG_DATA_HOME` or `HOME`, which would mean
+/// the current folder, is ignored; [`Error::Missing`] where no folder remains.
 pub fn home() -> Result<PathBuf> {
     choose(|name| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from), std::env::home_dir())
 }
@@ -28,24 +28,26 @@ fn choose(set: impl Fn(&str) -> Option<PathBuf>, user: Option<PathBuf>) -> Resul
 mod tests {
     use super::*;
 
-    #[test]
-    fn relative_variables_never_lead_to_the_current_folder() {
-        let choose = |own: &str, data: &str, user: Option<&str>| {
-            let set = |name: &str| match name {
-                "SPLATVK_HOME" => Some(own),
-                "XDG_DATA_HOME" => Some(data),
-                _ => None,
-            };
-            let set = |name: &str| set(name).filter(|v| !v.is_empty()).map(PathBuf::from);
-            super::choose(set, user.map(PathBuf::from))
+    /// The folder with these values of `SPLATVK_HOME`, `XDG_DATA_HOME` and the home directory.
+    fn chosen(own: &str, data: &str, user: Option<&str>) -> Result<PathBuf> {
+        let set = |name: &str| match name {
+            "SPLATVK_HOME" => Some(own),
+            "XDG_DATA_HOME" => Some(data),
+            _ => None,
         };
-        let at = |path: &str| Some(PathBuf::from(path));
-        assert_eq!(choose("", "/data", Some("/home/a")).ok(), at("/data/splatvk"));
-        assert_eq!(choose("", "data", Some("/home/a")).ok(), at("/home/a/.local/share/splatvk"));
-        assert_eq!(choose("/own", "data", None).ok(), at("/own"));
-        assert!(choose("own", "", None).unwrap().is_absolute());
+        let set = |name: &str| set(name).filter(|v| !v.is_empty()).map(PathBuf::from);
+        choose(set, user.map(PathBuf::from))
+    }
+
+    #[test]
+    fn home_ignores_relative_variables() {
+        let some_path = |path: &str| Some(PathBuf::from(path));
+        assert_eq!(chosen("", "/data", Some("/home/a")).ok(), some_path("/data/splatvk"));
+        assert_eq!(chosen("", "data", Some("/home/a")).ok(), some_path("/home/a/.local/share/splatvk"));
+        assert_eq!(chosen("/own", "data", None).ok(), some_path("/own"));
+        assert!(chosen("own", "", None).unwrap().is_absolute());
         for user in [None, Some("home"), Some("")] {
-            let e = choose("", "data", user).unwrap_err();
+            let e = chosen("", "data", user).unwrap_err();
             assert!(e.exit_code() == 2 && e.to_string().contains("SPLATVK_HOME"), "{e}");
         }
     }

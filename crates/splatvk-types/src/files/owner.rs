@@ -1,6 +1,6 @@
-//! Whose unfinished work a folder holds: a mark in it names the owner, and the owner holds a lock
-//! on that mark as long as it lives. Only what bears such a mark, and whose owner is certainly
-//! gone, is ever removed.
+//! Ownership of folders with unfinished work. A mark file in the folder names the owner, and the
+//! owner locks it as long as it lives. Only a folder with such a mark, whose owner has certainly
+//! ended, is ever removed.
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::fs::{File, TryLockError};
@@ -10,35 +10,34 @@ use std::time::Duration;
 
 /// The file in a folder of unfinished work that names its owner.
 const MARK: &str = "owner";
-/// The output lies here, or in the folder itself.
+/// Folder of the output; some outputs are in the marked folder itself.
 pub(super) const NEW: &str = "new";
-/// Where a result lies aside while another one takes its place, on file systems that cannot
-/// exchange two folders.
+/// Folder that holds the replaced result meanwhile, on file systems that cannot exchange two
+/// folders.
 const OLD: &str = "old";
 /// Most bytes of a mark: ten times a long one.
 const LONGEST_MARK: u64 = 1 << 14;
-/// Another process holds the lock of a dead owner only while it looks at the mark or sweeps: it is
-/// waited for this often.
-const PATIENCE: (u32, Duration) = (100, Duration::from_millis(20));
+/// Number and interval of attempts: another process holds the lock of a dead owner only while it
+/// reads the mark or sweeps.
+const LOCK_RETRIES: (u32, Duration) = (100, Duration::from_millis(20));
 
-/// The process that works in a folder, as its mark names it.
+/// The process that works in a folder, as recorded in its mark.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Owner {
-    /// What the folder is: a folder of another meaning has no such field.
+    /// Constant that identifies the file: marks of other programs have no such field.
     splatvk: String,
-    /// Name of the folder that the mark lies in: the mark of another folder says nothing of this
-    /// one.
+    /// Name of the marked folder: a mark that was moved to another folder is invalid.
     folder: String,
     /// Name of the output; empty for several files.
     place: String,
     host: String,
-    /// Identity of the kernel's run; empty where there is none to read.
+    /// Boot id of the kernel; empty where it cannot be read.
     boot: String,
-    /// Namespace in which the number of the process counts.
+    /// PID namespace in which the process number is valid.
     processes: String,
     process: u32,
-    /// When the process started, in ticks after the kernel's start: numbers of processes are used
-    /// again.
+    /// Start time of the process, in ticks after the start of the kernel: process numbers are
+    /// reused.
     started: u64,
 }
 
@@ -46,46 +45,46 @@ pub struct Owner {
 const UNFINISHED: &str = "unfinished work";
 
 impl Owner {
-    /// This process, in a folder.
+    /// The current process, as owner of a folder.
     fn this(folder: &Path, place: &Path) -> Owner {
-        let text = |path: &str| std::fs::read_to_string(path).unwrap_or_default().trim().to_owned();
+        let trimmed = |path: &str| std::fs::read_to_string(path).unwrap_or_default().trim().to_owned();
         let namespace = std::fs::read_link("/proc/self/ns/pid").unwrap_or_default();
         let process = std::process::id();
         Owner {
             splatvk: UNFINISHED.to_owned(),
             folder: name(folder),
             place: name(place),
-            host: text("/proc/sys/kernel/hostname"),
-            boot: text("/proc/sys/kernel/random/boot_id"),
+            host: trimmed("/proc/sys/kernel/hostname"),
+            boot: trimmed("/proc/sys/kernel/random/boot_id"),
             processes: namespace.to_string_lossy().into_owned(),
             process,
             started: started(process).unwrap_or(0),
         }
     }
 
-    /// Whether the number of the process means the same here.
+    /// Whether the process number is valid on this machine, boot and namespace.
     fn is_near(&self) -> bool {
         let here = Owner::this(Path::new(""), Path::new(""));
         let known = !here.boot.is_empty() && !here.processes.is_empty();
         known && (&self.host, &self.boot, &self.processes) == (&here.host, &here.boot, &here.processes)
     }
 
-    /// Whether the process has certainly ended; of one elsewhere only its lock can tell.
+    /// Whether the process has certainly ended; for a process elsewhere only its lock decides that.
     fn has_ended(&self) -> bool {
         self.is_near() && started(self.process) != Some(self.started)
     }
 
-    /// Whether nobody works in `folder` any more, where the mark is as `locked` says: free and held
-    /// by this call, or on a file system without locks.
+    /// Whether nobody works in `folder` any more. `locked`: the mark's lock was free and this call
+    /// holds it; false on a file system without locks.
     fn is_gone(&self, locked: bool, folder: &Path) -> bool {
         match self.is_near() {
-            // What this process works on, it holds.
+            // A folder that this process works in is locked.
             true => self.has_ended() || self.process == std::process::id() && locked,
             false => locked && locks_reach_everybody(folder),
         }
     }
 
-    /// For messages: who it is.
+    /// Name of the process in messages.
     fn text(&self) -> String {
         match self.is_near() {
             true => format!("process {}", self.process),
@@ -99,16 +98,16 @@ fn name(path: &Path) -> String {
     path.file_name().unwrap_or_default().to_string_lossy().into_owned()
 }
 
-/// When a living process started, in ticks after the kernel's start; `None` where there is none of
-/// that number, or no /proc.
+/// Start time of a living process, in ticks after the start of the kernel; `None` without such a
+/// process or without /proc.
 fn started(process: u32) -> Option<u64> {
     let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).ok()?;
     // The second field, the name, may hold anything; the 22nd is the time (proc(5)).
     stat.rsplit_once(')')?.1.split_whitespace().nth(19)?.parse().ok()
 }
 
-/// Whether a lock that is free here is free for every machine that sees the folder: so it is on
-/// file systems of one machine, and not on every network.
+/// Whether a lock that is free here is free for every machine that mounts the folder: true for
+/// local file systems, not for every network file system.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 fn locks_reach_everybody(folder: &Path) -> bool {
     use std::os::unix::ffi::OsStrExt;
@@ -130,7 +129,7 @@ fn locks_reach_everybody(folder: &Path) -> bool {
     ];
     let Ok(path) = std::ffi::CString::new(folder.as_os_str().as_bytes()) else { return false };
     let mut found = std::mem::MaybeUninit::<libc::statfs>::uninit();
-    // SAFETY: a text that ends with a zero byte, and a structure of that type for the answer, both
+    // SAFETY: a zero-terminated text, and a structure of the required type for the result, both
     // alive during the call.
     if unsafe { libc::statfs(path.as_ptr(), found.as_mut_ptr()) } != 0 {
         return false;
@@ -140,7 +139,7 @@ fn locks_reach_everybody(folder: &Path) -> bool {
     LOCAL.contains(&kind)
 }
 
-/// Locks are all that there is to go by: without /proc no process is known.
+/// Without /proc only locks identify a living process.
 #[cfg(not(all(target_os = "linux", target_env = "gnu")))]
 fn locks_reach_everybody(_: &Path) -> bool {
     !cfg!(target_os = "linux")
@@ -148,20 +147,20 @@ fn locks_reach_everybody(_: &Path) -> bool {
 
 /// State of a folder of unfinished work.
 pub enum Found {
-    /// Nothing is there.
+    /// The folder does not exist.
     Nothing,
-    /// An empty folder, or one with an empty mark: an owner was killed before it had written the
-    /// mark, or is about to write it.
+    /// An empty folder, or one with an empty mark: its owner was killed before it wrote the mark,
+    /// or is about to write it.
     Blank(Option<File>),
-    /// Its owner is gone. As long as this is kept, nobody else sweeps it.
+    /// Its owner is gone. While this value lives, no other process sweeps the folder.
     Left(Held),
-    /// Somebody works in it, or may.
+    /// A process works in it, or may work in it.
     Busy(Option<Owner>),
-    /// It bears no mark.
+    /// It has no valid mark.
     Foreign,
 }
 
-/// Looks at a folder without changing it. A link is never looked through.
+/// Examines a folder without changing it. Links are not followed.
 pub fn look(folder: &Path) -> Found {
     match folder.symlink_metadata() {
         Err(e) if e.kind() == ErrorKind::NotFound => return Found::Nothing,
@@ -169,9 +168,10 @@ pub fn look(folder: &Path) -> Found {
         _ => return Found::Foreign,
     }
     let mark = folder.join(MARK);
-    let only = |wanted: usize| std::fs::read_dir(folder).is_ok_and(|all| all.take(2).count() == wanted);
+    let has_entries =
+        |wanted: usize| std::fs::read_dir(folder).is_ok_and(|all| all.take(2).count() == wanted);
     match mark.symlink_metadata() {
-        Err(_) if only(0) => return Found::Blank(None),
+        Err(_) if has_entries(0) => return Found::Blank(None),
         Ok(meta) if meta.is_file() => {}
         _ => return Found::Foreign,
     }
@@ -182,7 +182,7 @@ pub fn look(folder: &Path) -> Found {
         Err(TryLockError::WouldBlock) => return Found::Busy(read(&mut lock, folder)),
     };
     if !is_at(&lock, &mark) {
-        // Swept and begun anew since it was opened.
+        // Swept and created anew since it was opened.
         return Found::Busy(None);
     }
     match read(&mut lock, folder) {
@@ -190,16 +190,18 @@ pub fn look(folder: &Path) -> Found {
             Found::Left(Held { folder: folder.to_path_buf(), place: owner.place, lock })
         }
         Some(owner) => Found::Busy(Some(owner)),
-        None if locked && lock.metadata().is_ok_and(|m| m.len() == 0) && only(1) => Found::Blank(Some(lock)),
+        None if locked && lock.metadata().is_ok_and(|m| m.len() == 0) && has_entries(1) => {
+            Found::Blank(Some(lock))
+        }
         None => Found::Foreign,
     }
 }
 
-/// The owner that a mark names; `None` where it is not the mark of this folder.
+/// Owner that a mark names; `None` if it is not the mark of this folder.
 fn read(mark: &mut File, folder: &Path) -> Option<Owner> {
     let mut text = String::new();
     mark.take(LONGEST_MARK).read_to_string(&mut text).ok()?;
-    // The first of two: whoever takes a folder over writes over the mark, and then cuts it off.
+    // First of possibly two values: taking a folder over overwrites the mark, then truncates it.
     let owner: Owner = serde_json::Deserializer::from_str(&text).into_iter().next()?.ok()?;
     (owner.splatvk == UNFINISHED && owner.folder == name(folder)).then_some(owner)
 }
@@ -212,7 +214,7 @@ fn is_at(file: &File, path: &Path) -> bool {
     matches!((file.metadata(), path.symlink_metadata()), (Ok(a), Ok(b)) if id(&a) == id(&b))
 }
 
-/// An open file keeps its name there.
+/// On other systems an open file keeps its name.
 #[cfg(not(unix))]
 fn is_at(_: &File, _: &Path) -> bool {
     true
@@ -223,16 +225,16 @@ fn is_at(_: &File, _: &Path) -> bool {
 pub struct Held {
     folder: PathBuf,
     place: String,
-    /// Held as long as this lives.
+    /// Locked as long as this value lives.
     lock: File,
 }
 
 impl Held {
-    /// Takes `folder` to work on `place`: makes it, or, where its owner is gone, takes it over,
-    /// with what is in it if `keep`. Where somebody works in it, or anything else is there, that is
-    /// bad input.
+    /// Takes `folder` to work on `place`: creates it, or takes it over where its owner is gone,
+    /// with its contents if `keep`. [`Error::Input`] where another process works in it or a folder
+    /// without a mark is there.
     pub fn take(folder: &Path, place: &Path, keep: bool) -> Result<Held> {
-        for _ in 0..PATIENCE.0 {
+        for _ in 0..LOCK_RETRIES.0 {
             match std::fs::create_dir(folder) {
                 Ok(()) => {
                     if let Some(held) = Held::mark(folder, place).map_err(Error::unwritable(place))? {
@@ -252,15 +254,15 @@ impl Held {
                 Found::Busy(Some(owner)) if !owner.has_ended() => {
                     return Err(busy(place, folder, Some(&owner)));
                 }
-                Found::Busy(_) => std::thread::sleep(PATIENCE.1),
+                Found::Busy(_) => std::thread::sleep(LOCK_RETRIES.1),
                 Found::Foreign => return Err(foreign(folder)),
             }
         }
         Err(busy(place, folder, None))
     }
 
-    /// Marks a folder that this process has just made; `None` where another one has taken it for a
-    /// leftover in this moment.
+    /// Marks a folder that this process has just created; `None` where another process has swept it
+    /// meanwhile.
     fn mark(folder: &Path, place: &Path) -> std::io::Result<Option<Held>> {
         let mark = folder.join(MARK);
         let mut lock = match File::options().read(true).write(true).create_new(true).open(&mark) {
@@ -271,7 +273,7 @@ impl Held {
                 return Err(e);
             }
         };
-        // Without locks others go by the process.
+        // Without locks other processes check the process number.
         if matches!(lock.try_lock(), Err(TryLockError::WouldBlock)) || !is_at(&lock, &mark) {
             return Ok(None);
         }
@@ -281,7 +283,7 @@ impl Held {
         Ok(Some(Held { folder: folder.to_path_buf(), place: name(place), lock }))
     }
 
-    /// The same folder under this process's name.
+    /// Writes this process into the mark of the same folder.
     fn renewed(mut self, place: &Path) -> std::io::Result<Held> {
         std::io::Seek::rewind(&mut self.lock)?;
         write(&mut self.lock, &self.folder, place)?;
@@ -296,42 +298,46 @@ impl Held {
         &self.folder
     }
 
-    /// Where what is replaced lies between two moves, where the system needs two.
+    /// Place of the replaced result between two moves, where the system needs two.
     pub fn aside(&self) -> PathBuf {
         self.folder.join(OLD)
     }
 
-    /// Brings back what a process that was killed between two moves had moved aside; whether
-    /// nothing of it is left here.
+    /// Restores a result that a killed process had moved aside; returns whether none is left here.
     pub fn put_back(&self) -> bool {
         let old = self.aside();
         if old.symlink_metadata().is_err() {
             return true;
         }
         let Some(place) = self.folder.parent().map(|parent| parent.join(&self.place)) else { return false };
-        // What cannot be named again stays, and so does what another one came in the place of
-        // before the new one was there: it may be all that is left of a scene.
+        // A name that is not UTF-8 cannot be restored. If something else is at the place and the
+        // new result was not moved there, the old one stays: it may be the last copy of a scene.
         let named = !self.place.is_empty() && !self.place.contains(char::REPLACEMENT_CHARACTER);
-        let moved = || [NEW, ""].iter().all(|part| !self.folder.join(part).join(&self.place).exists());
-        named && if place.symlink_metadata().is_ok() { moved() } else { std::fs::rename(&old, place).is_ok() }
+        let result_moved = || [NEW, ""].iter().all(|part| !self.folder.join(part).join(&self.place).exists());
+        named
+            && if place.symlink_metadata().is_ok() {
+                result_moved()
+            } else {
+                std::fs::rename(&old, place).is_ok()
+            }
     }
 
-    /// Removes the folder with all that is in it.
+    /// Removes the folder with its contents.
     pub fn clear(self) -> std::io::Result<()> {
         clear(&self.folder)
     }
 }
 
-/// On the disk before anything else is in the folder: after a power cut, too, what is there has an
-/// owner.
+/// Writes and syncs the mark before anything else is in the folder, so that it has an owner even
+/// after a power cut.
 fn write(mark: &mut File, folder: &Path, place: &Path) -> std::io::Result<()> {
     let text = serde_json::to_string_pretty(&Owner::this(folder, place)).map_err(std::io::Error::other)?;
     mark.write_all((text + "\n").as_bytes())?;
     mark.sync_all()
 }
 
-/// Removes a leftover that was just looked at, while its lock is held; what was moved aside goes
-/// back first.
+/// Removes a leftover that was just examined, while its lock is held; restores a result that was
+/// moved aside first.
 pub fn remove(folder: &Path, found: Found) -> std::io::Result<()> {
     match found {
         Found::Left(held) if held.put_back() => held.clear(),
@@ -339,7 +345,7 @@ pub fn remove(folder: &Path, found: Found) -> std::io::Result<()> {
             if lock.is_some() {
                 std::fs::remove_file(folder.join(MARK))?;
             }
-            // Never more than an empty folder: somebody may just have begun.
+            // Only an empty folder is removed: another process may have just created it.
             match std::fs::remove_dir(folder) {
                 Err(e) if !matches!(e.kind(), ErrorKind::NotFound | ErrorKind::DirectoryNotEmpty) => Err(e),
                 _ => Ok(()),
@@ -349,8 +355,8 @@ pub fn remove(folder: &Path, found: Found) -> std::io::Result<()> {
     }
 }
 
-/// Removes a folder of unfinished work, its mark last: killed in between, it leaves what still
-/// bears the mark.
+/// Removes a folder of unfinished work, its mark last, so that a kill in between leaves a marked
+/// folder.
 pub(super) fn clear(folder: &Path) -> std::io::Result<()> {
     for entry in std::fs::read_dir(folder)? {
         let path = entry?.path();
@@ -362,7 +368,7 @@ pub(super) fn clear(folder: &Path) -> std::io::Result<()> {
     std::fs::remove_dir(folder)
 }
 
-/// Removes a file, a link, or a folder with all that is in it; nothing that a link leads to.
+/// Removes a file, a link, or a folder with its contents; links are not followed.
 pub fn remove_any(path: &Path) -> std::io::Result<()> {
     match path.symlink_metadata()?.is_dir() {
         true => std::fs::remove_dir_all(path),
@@ -370,7 +376,7 @@ pub fn remove_any(path: &Path) -> std::io::Result<()> {
     }
 }
 
-/// The refusal of a place at which another process works.
+/// Error for a place at which another process works.
 pub fn busy(place: &Path, folder: &Path, owner: Option<&Owner>) -> Error {
     let who = owner.map_or(String::new(), |owner| format!(" ({})", owner.text()));
     let unsure = match owner {
@@ -390,7 +396,7 @@ fn foreign(folder: &Path) -> Error {
     ))
 }
 
-/// Makes a folder with a file in it, as a killed process leaves it. For tests.
+/// Creates a folder with a file in it, as a killed process leaves it. For tests.
 #[doc(hidden)]
 pub fn leave(folder: &Path) -> std::io::Result<()> {
     // No process has this number: the kernel's largest is 2²².
@@ -412,7 +418,7 @@ mod tests {
     #[test]
     fn owner_is_gone_only_for_certain() {
         let base = tempfile::tempdir().unwrap();
-        let at = |name: &str| base.path().join(name);
+        let path_of = |name: &str| base.path().join(name);
         type Case = (&'static str, fn(Owner) -> Owner, bool);
         let local = locks_reach_everybody(base.path());
         let cases: [Case; 6] = [
@@ -424,51 +430,51 @@ mod tests {
             ("own, let go", |o| o, true),
         ];
         for (name, by, gone) in cases {
-            leave_by(&at(name), by).unwrap();
-            assert_eq!(matches!(look(&at(name)), Found::Left(_)), gone, "{name}");
-            // Whoever holds the lock lives, wherever it is.
-            let lock = File::open(at(name).join(MARK)).unwrap();
+            leave_by(&path_of(name), by).unwrap();
+            assert_eq!(matches!(look(&path_of(name)), Found::Left(_)), gone, "{name}");
+            // A process that holds the lock is alive, wherever it runs.
+            let lock = File::open(path_of(name).join(MARK)).unwrap();
             lock.lock().unwrap();
-            assert!(matches!(look(&at(name)), Found::Busy(Some(_))), "{name}, locked");
+            assert!(matches!(look(&path_of(name)), Found::Busy(Some(_))), "{name}, locked");
             drop(lock);
-            let found = look(&at(name));
-            remove(&at(name), found).unwrap();
-            assert_eq!(at(name).exists(), !gone, "{name}");
+            let found = look(&path_of(name));
+            remove(&path_of(name), found).unwrap();
+            assert_eq!(path_of(name).exists(), !gone, "{name}");
         }
     }
 
     #[test]
     fn unmarked_folders_and_links_are_foreign() {
         let base = tempfile::tempdir().unwrap();
-        let at = |name: &str| base.path().join(name);
-        leave(&at(".a.partial-splatvk")).unwrap();
-        let mark = std::fs::read(at(".a.partial-splatvk").join(MARK)).unwrap();
+        let path_of = |name: &str| base.path().join(name);
+        leave(&path_of(".a.partial-splatvk")).unwrap();
+        let mark = std::fs::read(path_of(".a.partial-splatvk").join(MARK)).unwrap();
         // A note, an empty mark with something beside it, and the mark of another folder.
         for (name, text) in [("note", &b"a note"[..]), ("cut off", b""), ("moved", &mark)] {
-            std::fs::create_dir(at(name)).unwrap();
-            std::fs::write(at(name).join(MARK), text).unwrap();
-            std::fs::write(at(name).join("photo.jpg"), "precious").unwrap();
+            std::fs::create_dir(path_of(name)).unwrap();
+            std::fs::write(path_of(name).join(MARK), text).unwrap();
+            std::fs::write(path_of(name).join("photo.jpg"), "precious").unwrap();
         }
-        std::fs::create_dir(at("unmarked")).unwrap();
-        std::fs::write(at("unmarked/photo.jpg"), "precious").unwrap();
-        std::fs::write(at("file"), "precious").unwrap();
+        std::fs::create_dir(path_of("unmarked")).unwrap();
+        std::fs::write(path_of("unmarked/photo.jpg"), "precious").unwrap();
+        std::fs::write(path_of("file"), "precious").unwrap();
         #[cfg(unix)]
-        std::os::unix::fs::symlink(at(".a.partial-splatvk"), at("link")).unwrap();
+        std::os::unix::fs::symlink(path_of(".a.partial-splatvk"), path_of("link")).unwrap();
         for name in ["note", "cut off", "moved", "unmarked", "file", "link"] {
-            let Found::Foreign = look(&at(name)) else {
+            let Found::Foreign = look(&path_of(name)) else {
                 assert!(name == "link" && !cfg!(unix), "{name}");
                 continue;
             };
-            remove(&at(name), look(&at(name))).unwrap();
-            assert!(at(name).exists());
-            let e = Held::take(&at(name), &at("a"), false).unwrap_err();
+            remove(&path_of(name), look(&path_of(name))).unwrap();
+            assert!(path_of(name).exists());
+            let e = Held::take(&path_of(name), &path_of("a"), false).unwrap_err();
             assert!(e.exit_code() == 2 && e.to_string().contains("no mark of splatvk"), "{e}");
         }
-        assert!(at(".a.partial-splatvk/half").exists());
+        assert!(path_of(".a.partial-splatvk/half").exists());
     }
 
     #[test]
-    fn killed_before_the_mark_leaves_nothing_in_the_way() {
+    fn blank_folder_is_taken_over() {
         let base = tempfile::tempdir().unwrap();
         let folder = base.path().join("x");
         for marked in [false, true] {
@@ -485,27 +491,27 @@ mod tests {
     #[test]
     fn folder_moved_aside_comes_back() {
         let base = tempfile::tempdir().unwrap();
-        let at = |name: &str| base.path().join(name);
+        let path_of = |name: &str| base.path().join(name);
         for there in [false, true] {
-            leave(&at("x")).unwrap();
-            std::fs::create_dir(at("x").join(OLD)).unwrap();
-            std::fs::write(at("x").join(OLD).join("scene.json"), "old").unwrap();
+            leave(&path_of("x")).unwrap();
+            std::fs::create_dir(path_of("x").join(OLD)).unwrap();
+            std::fs::write(path_of("x").join(OLD).join("scene.json"), "old").unwrap();
             if there {
-                std::fs::create_dir(at("a.ply")).unwrap();
+                std::fs::create_dir(path_of("a.ply")).unwrap();
             }
-            remove(&at("x"), look(&at("x"))).unwrap();
-            assert!(!at("x").exists());
-            assert_eq!(at("a.ply/scene.json").exists(), !there, "nothing is written over");
-            std::fs::remove_dir_all(at("a.ply")).unwrap();
+            remove(&path_of("x"), look(&path_of("x"))).unwrap();
+            assert!(!path_of("x").exists());
+            assert_eq!(path_of("a.ply/scene.json").exists(), !there, "nothing is written over");
+            std::fs::remove_dir_all(path_of("a.ply")).unwrap();
         }
-        // Something came there while neither was at the place: what was moved aside is the only
-        // one.
-        leave(&at("x")).unwrap();
-        std::fs::create_dir_all(at("x").join(NEW).join("a.ply")).unwrap();
-        std::fs::create_dir(at("x").join(OLD)).unwrap();
-        std::fs::create_dir(at("a.ply")).unwrap();
-        remove(&at("x"), look(&at("x"))).unwrap();
-        assert!(at("x").join(OLD).exists());
+        // Another file came to the place while both results were moved: the one aside is the only
+        // copy.
+        leave(&path_of("x")).unwrap();
+        std::fs::create_dir_all(path_of("x").join(NEW).join("a.ply")).unwrap();
+        std::fs::create_dir(path_of("x").join(OLD)).unwrap();
+        std::fs::create_dir(path_of("a.ply")).unwrap();
+        remove(&path_of("x"), look(&path_of("x"))).unwrap();
+        assert!(path_of("x").join(OLD).exists());
     }
 
     #[test]
@@ -513,7 +519,7 @@ mod tests {
         let base = tempfile::tempdir().unwrap();
         let folder = base.path().join("x");
         leave(&folder).unwrap();
-        // Killed before it has cut off the rest of a longer mark.
+        // Killed before it truncated a longer mark.
         let mark = std::fs::read_to_string(folder.join(MARK)).unwrap();
         std::fs::write(folder.join(MARK), format!("{mark}}}\n")).unwrap();
         let held = Held::take(&folder, &base.path().join("b"), true).unwrap();

@@ -1,6 +1,6 @@
-//! What is being written, in a hidden folder that its owner has marked and locked: it goes when the
-//! work fails, when the process is stopped, and, where the process was killed, with the next one
-//! that writes to the place.
+//! Unfinished output in a hidden folder that its owner has marked and locked. It is removed when
+//! the work fails or the process is stopped; after a kill, by the next process that writes to the
+//! place.
 use super::owner::{self, Found, Held, NEW};
 use crate::sync::lock;
 use crate::{Error, Result};
@@ -9,53 +9,53 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard};
 
-/// What this process has begun: the hidden folder, and the folders that were made for it, deepest
-/// first.
+/// Unfinished outputs of this process: the hidden folder, and the folders that were created for it,
+/// deepest first.
 static UNFINISHED: Mutex<Vec<(PathBuf, Vec<PathBuf>)>> = Mutex::new(Vec::new());
-/// Whether this process has finished anything that a user asked for.
+/// Whether this process has finished any output that a user requested.
 static FINISHED: AtomicBool = AtomicBool::new(false);
 
-/// How the names of hidden folders end. A place has one such name, so that one process at a time
-/// writes to it.
+/// Ending of the names of hidden folders. Each place has one such name, so that only one process at
+/// a time writes to it.
 pub const HIDDEN: &str = ".partial-splatvk";
-/// Longest name, in bytes, that is part of that of its hidden folder: file systems take 255.
+/// Longest name, in bytes, that is kept in the name of the hidden folder: file systems take 255.
 const LONGEST_NAME: usize = 200;
 
 fn unfinished() -> MutexGuard<'static, Vec<(PathBuf, Vec<PathBuf>)>> {
-    // A panic while holding the lock leaves a list that is still right.
+    // A panic while the lock is held leaves the list consistent.
     lock(&UNFINISHED)
 }
 
-/// A file or folder that is being written. Dropped without [`Partial::finish`], it vanishes, and
-/// with it the folders that were made for it. While it lives, no other process and no other thread
-/// writes to its place.
+/// A file or folder that is being written. Dropped without [`Partial::finish`], it is removed
+/// together with the folders that were created for it. While it lives, no other process or thread
+/// can write to its place.
 #[derive(Debug)]
 pub struct Partial {
     path: PathBuf,
-    /// `None` once it is taken apart.
+    /// `None` once the folder is removed.
     held: Option<Held>,
 }
 
 impl Partial {
-    /// For one file or folder: beside `place`, whose folders are made where they are missing. A
-    /// place that another process writes to is bad input.
+    /// Output of one file or folder, beside `place`; missing folders are created. [`Error::Input`]
+    /// where another process writes to the place.
     pub fn beside(place: &Path) -> Result<Partial> {
         let mut partial = Partial::reserve(parent(place), &hidden_beside(place), place)?;
-        // Under its own name, of which writers take the ending.
+        // Keeps its own name: writers choose the format by its extension.
         std::fs::create_dir(&partial.path).map_err(Error::unwritable(place))?;
         partial.path.push(place.file_name().unwrap_or_default());
         Ok(partial)
     }
 
-    /// For several files: inside of `folder`, which is made where it is missing.
+    /// Output of several files, inside `folder`, which is created where it is missing.
     pub fn inside(folder: &Path) -> Result<Partial> {
         Partial::reserve(folder, &folder.join(HIDDEN), folder)
     }
 
     fn reserve(parent: &Path, hidden: &Path, place: &Path) -> Result<Partial> {
-        // An exit waits for it: between the two it would leave the folders.
+        // An exit waits for the lock: between the two calls it would leave the folders.
         let mut list = unfinished();
-        let made = make(parent).map_err(Error::unwritable(place))?;
+        let made = create_missing(parent).map_err(Error::unwritable(place))?;
         match Held::take(hidden, place, false) {
             Ok(held) => {
                 list.push((hidden.to_path_buf(), made));
@@ -68,18 +68,18 @@ impl Partial {
         }
     }
 
-    /// Where to write: nothing is there, in a folder that is.
+    /// Path to write to: nothing is there, and its folder exists.
     pub fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Where what is replaced may lie for the moment between two moves.
+    /// Path for the replaced output between two moves.
     pub fn aside(&self) -> PathBuf {
         self.held.as_ref().map(Held::aside).unwrap_or_default()
     }
 
-    /// Moves what was written to its place, by `rename`; what is at [`Partial::path`] and
-    /// [`Partial::aside`] after that, goes. An exit waits for the move.
+    /// Moves the output to its place by `rename`, then removes the rest at [`Partial::path`] and
+    /// [`Partial::aside`]. An exit waits for the move.
     pub fn finish<E>(self, rename: impl FnOnce(&Path) -> Result<(), E>) -> Result<(), E> {
         self.keep(|path| {
             rename(path)?;
@@ -88,7 +88,7 @@ impl Partial {
         })
     }
 
-    /// [`Partial::finish`] of what no user has asked for.
+    /// Like [`Partial::finish`], for an output that no user requested.
     pub fn keep<E>(mut self, rename: impl FnOnce(&Path) -> Result<(), E>) -> Result<(), E> {
         let list = unfinished();
         rename(&self.path)?;
@@ -100,16 +100,17 @@ impl Partial {
     fn take_apart(&mut self) {
         let Some(held) = self.held.take() else { return };
         let hidden = held.folder().to_path_buf();
-        let at = |list: &[(PathBuf, Vec<PathBuf>)]| list.iter().position(|(path, _)| *path == hidden);
-        if at(&unfinished()).is_none() {
-            // Removed on the way to an exit.
+        let position_in =
+            |list: &[(PathBuf, Vec<PathBuf>)]| list.iter().position(|(path, _)| *path == hidden);
+        if position_in(&unfinished()).is_none() {
+            // Already removed by [`remove_unfinished`].
             return;
         }
-        // The error on the way out is the one to report, and a result that is at its place is
-        // whole; the next process sweeps the rest.
+        // The first error is the one to report, and a result at its place is complete; the next
+        // process sweeps the rest.
         let _ = held.clear();
         let mut list = unfinished();
-        if let Some(at) = at(&list) {
+        if let Some(at) = position_in(&list) {
             remove_empty(&list.swap_remove(at).1);
         }
     }
@@ -121,7 +122,7 @@ impl Drop for Partial {
     }
 }
 
-/// The folder that a place is in.
+/// Folder of a place.
 fn parent(place: &Path) -> &Path {
     match place.parent() {
         Some(p) if !p.as_os_str().is_empty() => p,
@@ -129,7 +130,7 @@ fn parent(place: &Path) -> &Path {
     }
 }
 
-/// The hidden folder of a file or folder that is written as a whole.
+/// Hidden folder for an output that is written as a whole.
 fn hidden_beside(place: &Path) -> PathBuf {
     let mut own = OsString::from(".");
     match place.file_name().unwrap_or_default() {
@@ -140,9 +141,9 @@ fn hidden_beside(place: &Path) -> PathBuf {
     parent(place).join(own)
 }
 
-/// Makes the folders of a path that are missing; those that were made, deepest first. A `..` behind
-/// a missing one leads nowhere.
-fn make(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
+/// Creates the missing folders of a path; returns them, deepest first. A `..` behind a missing
+/// folder is refused.
+fn create_missing(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     let missing = folder.ancestors().take_while(|p| !p.as_os_str().is_empty() && !p.exists());
     let missing: Vec<PathBuf> = missing.map(Path::to_path_buf).collect();
     if missing.iter().any(|p| p.ends_with("..")) {
@@ -152,14 +153,14 @@ fn make(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(missing)
 }
 
-/// A folder that others wrote into stays, as it is not empty.
+/// Removes folders that are empty; one that others wrote into stays.
 fn remove_empty(folders: &[PathBuf]) {
     for folder in folders {
         let _ = std::fs::remove_dir(folder);
     }
 }
 
-/// Refuses a place, to be written as a whole, that another process writes to.
+/// Refuses a place for a whole output if another process writes to it.
 pub fn check_free(place: &Path) -> Result<()> {
     check_hidden(place, &hidden_beside(place))
 }
@@ -176,15 +177,15 @@ fn check_hidden(place: &Path, hidden: &Path) -> Result<()> {
     }
 }
 
-/// Brings back what a process that was killed between two moves had moved aside from `place`.
+/// Restores a result that a killed process had moved aside from `place`.
 pub fn restore(place: &Path) {
     if let Found::Left(held) = owner::look(&hidden_beside(place)) {
         held.put_back();
     }
 }
 
-/// Removes everything unfinished of this process, for exits that run no destructors; whether
-/// nothing that a user asked for had been finished before.
+/// Removes all unfinished outputs of this process, for exits that run no destructors; returns
+/// whether no requested output had been finished before.
 pub fn remove_unfinished() -> bool {
     for (hidden, made) in unfinished().drain(..) {
         let _ = owner::clear(&hidden);
@@ -193,18 +194,18 @@ pub fn remove_unfinished() -> bool {
     nothing_finished()
 }
 
-/// Whether this process has finished nothing that a user asked for.
+/// Whether this process has finished no requested output.
 fn nothing_finished() -> bool {
     !FINISHED.load(Ordering::SeqCst)
 }
 
-/// Whether a path has the name of a hidden folder, its owner's mark, and no owner any more.
+/// Whether a path is a hidden folder with a mark whose owner is gone.
 pub fn is_leftover(path: &Path) -> bool {
     let named = path.file_name().is_some_and(|n| n.as_encoded_bytes().ends_with(HIDDEN.as_bytes()));
     named && matches!(owner::look(path), Found::Left(_) | Found::Blank(_))
 }
 
-/// Unfinished work in a folder whose processes are gone.
+/// Hidden folders in `folder` whose owners are gone.
 pub fn leftovers(folder: &Path) -> Vec<PathBuf> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let mut found: Vec<PathBuf> = entries.map(|e| e.path()).filter(|p| is_leftover(p)).collect();
@@ -212,16 +213,16 @@ pub fn leftovers(folder: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Removes one of [`leftovers`], unless somebody has begun to work in it; what was moved aside goes
-/// back to its place.
+/// Removes one of [`leftovers`], unless a process has begun to work in it; restores a result that
+/// was moved aside.
 pub fn remove_leftover(path: &Path) -> std::io::Result<()> {
     owner::remove(path, owner::look(path))
 }
 
-/// Removes [`leftovers`] in a folder, and what was left beside it of a whole one in its place.
+/// Removes [`leftovers`] in a folder, and the one beside it of an output in its place.
 pub fn sweep(folder: &Path) {
     for path in leftovers(folder).into_iter().chain([hidden_beside(folder)]) {
-        // Another process may have swept it, or it is another user's.
+        // Another process may have swept it, or it belongs to another user.
         let _ = remove_leftover(&path);
     }
 }
@@ -231,7 +232,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn unfinished_work_goes_with_the_folders_made_for_it() {
+    fn dropped_partial_removes_created_folders() {
         let base = tempfile::tempdir().unwrap();
         let place = base.path().join("a/b/c.ply");
         let partial = Partial::beside(&place).unwrap();
@@ -252,15 +253,15 @@ mod tests {
     }
 
     #[test]
-    fn second_writer_of_one_place_is_refused() {
+    fn second_writer_of_place_is_refused() {
         let base = tempfile::tempdir().unwrap();
         let place = base.path().join("a.ply");
         let first = Partial::beside(&place).unwrap();
-        let said = Partial::beside(&place).unwrap_err();
+        let refusal = Partial::beside(&place).unwrap_err();
         let me = format!("process {}", std::process::id());
-        assert!(said.exit_code() == 2 && said.to_string().contains(&me), "{said}");
+        assert!(refusal.exit_code() == 2 && refusal.to_string().contains(&me), "{refusal}");
         assert!(check_free(&place).is_err() && check_free(&base.path().join("b.ply")).is_ok());
-        // The other is as it was.
+        // The first writer is not affected.
         std::fs::write(first.path(), "one").unwrap();
         first.finish(|path| std::fs::rename(path, &place)).unwrap();
         drop(Partial::beside(&place).unwrap());
@@ -271,7 +272,7 @@ mod tests {
     }
 
     #[test]
-    fn dot_dot_behind_missing_folder_makes_nothing() {
+    fn dot_dot_behind_missing_folder_fails() {
         let base = tempfile::tempdir().unwrap();
         let e = Partial::beside(&base.path().join("a/../b.ply")).unwrap_err();
         assert_eq!(e.exit_code(), 2, "{e}");

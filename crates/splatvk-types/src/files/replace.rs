@@ -1,10 +1,9 @@
-//! One folder in the place of another, so that a process that is killed at any moment leaves one of
-//! them there.
+//! Replacement of a folder by another; a process that is killed at any moment leaves one of them.
 use std::path::Path;
 
-/// Puts the folder `new` at `place`, where another one is; that one is at `new` or `aside`
-/// afterwards. In one step where the system can; a process that is killed within several leaves it
-/// at `aside`, and nothing at the place.
+/// Moves the folder `new` to `place`, where another folder is; that one is at `new` or `aside`
+/// afterwards. Atomic where the system can exchange two folders; otherwise a process that is killed
+/// between the two moves leaves it at `aside`, and nothing at the place.
 pub fn swap(new: &Path, place: &Path, aside: &Path) -> std::io::Result<()> {
     match exchange(new, place) {
         Ok(()) => Ok(()),
@@ -20,7 +19,7 @@ fn by_renaming(new: &Path, place: &Path, aside: &Path) -> std::io::Result<()> {
     })
 }
 
-/// File systems and kernels without it say so in these ways.
+/// Whether the file system or kernel cannot exchange two folders.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 fn unsupported(e: &std::io::Error) -> bool {
     [libc::EINVAL, libc::ENOSYS, libc::EOPNOTSUPP].map(Some).contains(&e.raw_os_error())
@@ -31,7 +30,7 @@ fn exchange(a: &Path, b: &Path) -> std::io::Result<()> {
     use std::os::unix::ffi::OsStrExt;
     let text = |p: &Path| std::ffi::CString::new(p.as_os_str().as_bytes());
     let (a, b) = (text(a)?, text(b)?);
-    // SAFETY: two texts that end with a zero byte and outlive the call.
+    // SAFETY: two zero-terminated texts that outlive the call.
     match unsafe {
         libc::renameat2(libc::AT_FDCWD, a.as_ptr(), libc::AT_FDCWD, b.as_ptr(), libc::RENAME_EXCHANGE)
     } {
@@ -67,8 +66,8 @@ mod tests {
     fn exchanged_and_renamed_folders_are_whole() {
         for swap in [swap, by_renaming] {
             let base = tempfile::tempdir().unwrap();
-            let at = |name: &str| base.path().join(name);
-            let (new, place, aside) = (at("new"), at("scene"), at("old"));
+            let path_of = |name: &str| base.path().join(name);
+            let (new, place, aside) = (path_of("new"), path_of("scene"), path_of("old"));
             folder(&new, "new");
             folder(&place, "old");
             swap(&new, &place, &aside).unwrap();

@@ -1,8 +1,8 @@
-//! Files that another file names.
+//! Resolution of file names that stand in other files.
 use std::path::{Component, Path, PathBuf};
 
-/// The file of a name that stands in a file of `folder`; `None` where it lies outside: absolute,
-/// through "..", or through a link. What is not there, or leads in a circle, is left to the reader.
+/// Path of a name that a file of `folder` contains; `None` where it lies outside: absolute, through
+/// "..", or through a link. A missing file and a circle of links are left to the reader.
 pub fn within(folder: &Path, name: &str) -> Option<PathBuf> {
     let below = |step| matches!(step, Component::Normal(_) | Component::CurDir);
     if name.contains('\\') || !Path::new(name).components().all(below) {

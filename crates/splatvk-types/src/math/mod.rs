@@ -1,4 +1,4 @@
-//! Arithmetic that several folders share; depends on nothing else here.
+//! Arithmetic that several folders share; depends on no other module of the crate.
 mod random;
 mod statistics;
 
@@ -10,12 +10,12 @@ pub fn dot_f32(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(|(x, y)| x * y).sum()
 }
 
-/// Length of a raw quaternion, above 0.
+/// Length of an unnormalised quaternion, above 0.
 pub fn quaternion_norm(q: &[f32; 4]) -> f32 {
     q.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE)
 }
 
-/// Logistic function: the opacity of a raw parameter.
+/// Logistic function: opacity of an opacity logit.
 pub fn sigmoid(v: f32) -> f32 {
     1.0 / (1.0 + (-v).exp())
 }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 pub struct Random(u64);
 
 impl Random {
-    /// A generator for a seed.
+    /// Generator with a seed.
     pub fn new(seed: u64) -> Self {
         Random(seed)
     }
@@ -52,7 +52,7 @@ impl Random {
         let radius = (-2.0 * (1.0 - self.uniform()).ln()).sqrt();
         sigma * radius * (std::f64::consts::TAU * self.uniform()).cos()
     }
-    /// A random order of 0..n. Benchmarks rest on its draws, which are not those of `shuffle`.
+    /// Random order of 0..n. Benchmarks rest on its draws, which are not those of `shuffle`.
     pub fn permutation(&mut self, n: usize) -> Vec<usize> {
         let mut order: Vec<usize> = (0..n).collect();
         for i in (1..n).rev() {
@@ -60,7 +60,7 @@ impl Random {
         }
         order
     }
-    /// Fisher–Yates.
+    /// Shuffles by Fisher–Yates.
     pub fn shuffle<T>(&mut self, items: &mut [T]) {
         for i in (1..items.len()).rev() {
             items.swap(i, self.below(i + 1));
@@ -79,9 +79,9 @@ pub fn hash(mut v: u32) -> u32 {
 mod tests {
     use super::*;
 
-    /// Kept runs, checkpoints and recorded figures rest on the sequence.
+    /// Cached runs, checkpoints and recorded figures rest on the sequence.
     #[test]
-    fn the_sequence_is_the_published_one() {
+    fn sequence_matches_published_values() {
         let mut random = Random::new(1_234_567);
         let first = [(); 3].map(|()| random.bits());
         assert_eq!(first, [6_457_827_717_110_365_317, 3_203_168_211_198_807_973, 9_817_491_932_198_370_423]);

@@ -19,7 +19,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_even_count_takes_the_upper_middle() {
+    fn median_of_even_count_is_upper() {
         assert_eq!(median(&mut [3.0, 1.0, 2.0]), Some(2.0));
         assert_eq!(median(&mut [4.0, 1.0, 3.0, 2.0]), Some(3.0));
         assert_eq!(median(&mut []), None);

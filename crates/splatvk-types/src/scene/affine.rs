@@ -1,4 +1,4 @@
-//! Where a pixel goes when an image is resized, cropped or padded.
+//! Pixel maps of resizing, cropping and padding.
 use super::Camera;
 use serde::{Deserialize, Serialize};
 
@@ -13,7 +13,7 @@ pub struct Affine {
 }
 
 impl Affine {
-    /// Every pixel stays where it is.
+    /// Identity map.
     pub const IDENTITY: Affine = Affine { scale: [1.0; 2], offset: [0.0; 2] };
 
     /// The map of a resize between two sizes `(width, height)`. The scales come from the rounded
@@ -43,7 +43,7 @@ impl Affine {
             offset: [0, 1].map(|k| next.scale[k] * self.offset[k] + next.offset[k]),
         }
     }
-    /// The camera of the target image, `size` = (width, height) of the target; the pose stays.
+    /// Camera of the target image with `size` = (width, height); the pose is unchanged.
     pub fn camera(&self, source: &Camera, size: (u32, u32)) -> Camera {
         let [cx, cy] = self.apply([source.cx, source.cy]);
         Camera {
@@ -66,7 +66,7 @@ mod tests {
     use glam::{DVec2, DVec3};
 
     #[test]
-    fn corners_survive_original_to_model_and_back() {
+    fn affine_inverse_restores_corners() {
         // An odd size, resized to rounded sizes, cropped, padded (negative crop).
         let map = Affine::resize((4031, 3025), (683, 512))
             .then(&Affine::crop(5.0, 0.0))
@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mapped_camera_projects_where_the_map_sends_the_pixel() {
+    fn mapped_camera_projects_to_mapped_pixel() {
         let camera = Camera {
             name: "a".into(),
             width: 4000,

@@ -70,10 +70,10 @@ fn skew(v: DVec3) -> DMat3 {
 pub const MAX_SIDE: u32 = 16_384;
 /// Most pixels of an image: the largest photos that phones take.
 pub const MAX_PIXELS: u64 = 200_000_000;
-/// Bytes of a camera's name after its folders: file systems take 255 with what is appended
+/// Longest file name of a camera, bytes: file systems take 255 with the suffixes of outputs
 /// ("_relevancy.npy").
 const LONGEST_NAME: usize = 200;
-/// Bytes of a camera's name with its folders, as Linux takes them.
+/// Longest name of a camera with its folders, bytes, as Linux takes them.
 const LONGEST_PATH: usize = 4096;
 
 /// A pinhole camera without distortion. Pixel units; the centre of the first pixel is (0.5, 0.5).
@@ -98,8 +98,8 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Refuses what no pinhole camera can be, and what nothing can be written for: images beyond
-    /// [`MAX_SIDE`] and [`MAX_PIXELS`], names that are no names of files.
+    /// Refuses cameras that are no pinhole, and those for which no output can be written: images
+    /// beyond [`MAX_SIDE`] and [`MAX_PIXELS`], names that are not file names.
     pub fn checked(self) -> Result<Camera, String> {
         let c = self;
         c.check_name()?;
@@ -158,7 +158,7 @@ impl Camera {
     pub fn ray(&self, pixel: DVec2) -> DVec3 {
         DVec3::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy, 1.0)
     }
-    /// The same camera for an image resized to `width × height`.
+    /// Camera for the same image resized to `width × height`.
     pub fn resized(&self, width: u32, height: u32) -> Camera {
         let (sx, sy) = (width as f64 / self.width as f64, height as f64 / self.height as f64);
         Camera {
@@ -179,7 +179,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn exp_is_a_rigid_motion_and_matches_its_series() {
+    fn exp_is_rigid_and_composes() {
         for scale in [1e-9, 1e-5, 0.3, 2.5] {
             let p = Pose::exp(DVec3::new(0.2, -0.4, 0.1) * scale, DVec3::new(0.5, 0.3, -0.7) * scale);
             let error = (p.rotation * p.rotation.transpose() - DMat3::IDENTITY).to_cols_array();
@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nothing_can_be_written_for_is_refused() {
+    fn camera_with_unwritable_output_is_refused() {
         let camera = |name: &str, width, height| {
             let pose = Pose::IDENTITY;
             Camera { name: name.into(), width, height, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pose }.checked()
@@ -208,13 +208,13 @@ mod tests {
     }
 
     #[test]
-    fn a_mirrored_matrix_is_no_rotation() {
+    fn mirrored_matrix_is_no_rotation() {
         let camera = |diagonal: DVec3| {
             let pose = Pose { rotation: DMat3::from_diagonal(diagonal), ..Pose::IDENTITY };
             Camera { name: "a".into(), width: 9, height: 9, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, pose }
                 .checked()
         };
-        // A half turn has two axes the other way round, a mirror one.
+        // A half turn flips two axes, a mirror one.
         assert!(camera(DVec3::new(-1.0, -1.0, 1.0)).is_ok());
         assert!(camera(DVec3::new(-1.0, 1.0, 1.0)).unwrap_err().contains("not a rotation"));
     }

@@ -1,37 +1,36 @@
-//! What a splat carries on a level, in five bytes: where it lies between two codes, and how sure
-//! that is.
+//! Language feature of a splat on one level in five bytes: two codes and a mixing share.
 use crate::math::dot_f32 as dot;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Steps of [`CodeMix::share`] in a whole. Of two codes the nearer one comes first, so that half of
-/// it is enough: a byte.
+/// Steps of [`CodeMix::share`] from 0 to 1. The nearer code comes first, so the share is at most
+/// half: a byte.
 const SHARE_STEPS: f32 = 510.0;
 
-/// Splats whose feature is shorter have none: lifting leaves exact zeros, training moves them by
+/// Shortest feature of a splat that has one: lifting leaves exact zeros, training moves them by
 /// less than this.
 pub const MIN_LENGTH: f32 = 0.1;
 
 /// A unit feature as the nearest mix of its nearest code with another. Blending and decoding read a
 /// feature only through its cosines to the codes, and a splat between two things mixes two of them;
-/// docs/internals/method.md#feature-storage has what that costs.
+/// docs/internals/method.md#feature-storage states the error of this.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CodeMix {
-    /// The nearest code; the number of codes where the splat has no feature.
+    /// Nearest code; the number of codes where the splat has no feature.
     pub first: u16,
-    /// The code that comes nearest to the feature together with the first.
+    /// Code that comes nearest to the feature together with the first.
     pub second: u16,
-    /// Share of the second code, in 1/510.
+    /// Share of the second code, in units of 1/510.
     pub share: u8,
 }
 
 impl CodeMix {
-    /// Of a feature [d] of any length among codes [K, d].
-    fn of(feature: &[f32], codes: &[f32]) -> CodeMix {
+    /// Mix for a feature [d] of any length among codes [K, d].
+    fn nearest(feature: &[f32], codes: &[f32]) -> CodeMix {
         let count = codes.len() / feature.len();
         let none = CodeMix { first: count as u16, second: count as u16, share: 0 };
         let length = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
-        // False for what is not a number, too.
+        // False for NaN, too.
         let carried = length >= MIN_LENGTH;
         if !carried {
             return none;
@@ -41,14 +40,14 @@ impl CodeMix {
         let Some((a, first)) = (0..count).map(|k| (cosine(k), k)).max_by(|x, y| x.0.total_cmp(&y.0)) else {
             return none;
         };
-        // Weights of the combination of the two that is nearest to the feature (least squares of
-        // unit vectors), and how much nearer it is than the first code alone.
-        let with = |k: usize| {
+        // Weights of the combination of the two codes that is nearest to the feature (least squares
+        // of unit vectors), and the gain over the first code alone.
+        let gain_of = |k: usize| {
             let (b, ab) = (cosine(k), dot(row(codes, first, d), row(codes, k, d)));
             let weight = (b - ab * a).max(0.0);
             (weight * weight / (1.0 - ab * ab).max(f32::EPSILON), k, a - ab * b, weight)
         };
-        let best = (0..count).filter(|k| *k != first).map(with).max_by(|x, y| x.0.total_cmp(&y.0));
+        let best = (0..count).filter(|k| *k != first).map(gain_of).max_by(|x, y| x.0.total_cmp(&y.0));
         let (_, second, first_weight, second_weight) = best.unwrap_or((0.0, first, 1.0, 0.0));
         let share = second_weight / (first_weight + second_weight).max(f32::MIN_POSITIVE);
         let share = (SHARE_STEPS * share).round().clamp(0.0, 255.0) as u8;
@@ -56,7 +55,7 @@ impl CodeMix {
         CodeMix { first: first as u16, second: second as u16, share }
     }
 
-    /// Writes the unit feature [d] that it stands for; zeros for none.
+    /// Writes the unit feature [d] of the mix; zeros where there is none.
     fn write(self, codes: &[f32], out: &mut [f32]) {
         out.fill(0.0);
         let count = codes.len() / out.len();
@@ -76,16 +75,16 @@ impl CodeMix {
     }
 }
 
-/// The mixes of codes [K, d] nearest to features [N, d]; nothing where the codes are more than a
-/// mix can name.
+/// Mixes of codes [K, d] nearest to features [N, d]; empty where there are more codes than a mix
+/// can index.
 pub fn mixes(features: &[f32], codes: &[f32], d: usize) -> Vec<CodeMix> {
     if d == 0 || codes.len() / d >= usize::from(u16::MAX) {
         return Vec::new();
     }
-    features.par_chunks_exact(d).map(|f| CodeMix::of(f, codes)).collect()
+    features.par_chunks_exact(d).map(|f| CodeMix::nearest(f, codes)).collect()
 }
 
-/// The unit features [N, d] of mixes of codes [K, d].
+/// Unit features [N, d] of mixes of codes [K, d].
 pub fn features(mixes: &[CodeMix], codes: &[f32], d: usize) -> Vec<f32> {
     let mut out = vec![0.0; mixes.len() * d];
     if d > 0 {
@@ -104,7 +103,7 @@ mod tests {
     use crate::math::Random;
 
     #[test]
-    fn a_mix_of_two_codes_survives_and_no_feature_stays_none() {
+    fn code_mix_survives_round_trip() {
         let codes = [1.0, 0.0, 0.0, 0.6, 0.8, 0.0, 0.0, 0.0, 1.0];
         let mut random = Random::new(1000);
         for _ in 0..200 {
@@ -118,7 +117,7 @@ mod tests {
             let back = features(&mix, &codes, 3);
             // Half a step of the share moves a unit vector by at most 1/510 of the codes' distance.
             assert!(dot(&back, &feature) / length > 1.0 - 1e-5, "{a} {b} {t}: {back:?} of {feature:?}");
-            // Storing what was stored changes nothing.
+            // Storing a stored feature changes nothing.
             assert_eq!(features(&mixes(&back, &codes, 3), &codes, 3), back);
         }
         let none = mixes(&[0.05, 0.0, 0.0, f32::NAN, 0.0, 0.0], &codes, 3);
@@ -126,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn a_single_code_and_opposite_codes_give_unit_features() {
+    fn code_mix_of_extremes_is_unit() {
         let stored = |feature: &[f32], codes: &[f32]| features(&mixes(feature, codes, 3), codes, 3);
         assert_eq!(stored(&[0.3, 0.4, 0.0], &[0.0, 1.0, 0.0]), [0.0, 1.0, 0.0]);
         assert_eq!(stored(&[0.5, 0.5, 0.0], &[1.0, 0.0, 0.0, -1.0, 0.0, 0.0]), [1.0, 0.0, 0.0]);

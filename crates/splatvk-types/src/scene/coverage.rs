@@ -1,4 +1,4 @@
-//! Which pixels of a photo are used.
+//! Coverage: the used pixels of a photo.
 use super::image::{Image, RgbImage};
 use serde::{Deserialize, Serialize};
 
@@ -8,27 +8,27 @@ use serde::{Deserialize, Serialize};
 pub enum Outside {
     /// Unknown content, as under a mask. No loss counts them.
     Unknown,
-    /// Nothing is there: a transparent background. Renders become transparent there.
+    /// A transparent background. Renders become transparent there.
     Empty,
 }
 
 /// The used pixels of a photo, and the meaning of the others.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Coverage {
-    /// [H, W] share of every working pixel that is used, in [0, 1].
+    /// [H, W] used share of every working pixel, in [0, 1].
     pub share: Image<f32>,
     /// Meaning of the other pixels.
     pub outside: Outside,
 }
 
 impl Coverage {
-    /// A pixel counts for matches, depth and masks where at least half of it is used.
+    /// Whether a pixel counts for matches, depth and masks: at least half of it is used.
     pub fn uses(&self, index: usize) -> bool {
         self.share.data[index] >= 0.5
     }
 
-    /// [H, W] weight of every pixel in losses: 0 or 1. Emptiness is shown as well as things are; of
-    /// what is not known even a part would count.
+    /// [H, W] weight of every pixel in losses: 0 or 1. Empty pixels count fully, as their colour is
+    /// known; of unknown content even a part of a pixel would distort the loss.
     pub fn weights(&self) -> Image<f32> {
         let weight = |share: &f32| match self.outside {
             Outside::Empty => 1.0,
@@ -38,20 +38,20 @@ impl Coverage {
         Image { data: self.share.data.iter().map(weight).collect(), ..self.share.clone() }
     }
 
-    /// A coverage, or all pixels, without those where something hides the scene; the scene behind
-    /// them is unknown.
+    /// Coverage, or all pixels, without the pixels where something hides the scene; the scene
+    /// behind them is unknown.
     pub fn without(before: Option<&Coverage>, hidden: &Image<bool>) -> Coverage {
-        let left = |(i, hidden): (usize, &bool)| match before {
+        let remaining = |(i, hidden): (usize, &bool)| match before {
             _ if *hidden => 0.0,
             Some(before) => before.share.data[i],
             None => 1.0,
         };
-        let data = hidden.data.iter().enumerate().map(left).collect();
+        let data = hidden.data.iter().enumerate().map(remaining).collect();
         let share = Image { width: hidden.width, height: hidden.height, data };
         Coverage { share, outside: Outside::Unknown }
     }
 
-    /// What a render is compared with: on black, where nothing is there.
+    /// Target of a render: black where nothing is there.
     pub fn target(&self, image: &RgbImage) -> RgbImage {
         match self.outside {
             Outside::Unknown => image.clone(),
@@ -64,9 +64,9 @@ impl Coverage {
 }
 
 impl RgbImage {
-    /// Gives pixels that are not used colours that go on smoothly from the used ones, so that
-    /// neither filters nor features see an edge: means over larger and larger blocks (pull-push,
-    /// Gortler et al. 1996). Without any used pixel nothing changes.
+    /// Fills unused pixels with colours that continue the used ones smoothly, so that neither
+    /// filters nor features see an edge: means over larger and larger blocks (pull-push, Gortler et
+    /// al. 1996). Without any used pixel nothing changes.
     pub fn fill_from_used(&mut self, used: impl Fn(usize) -> bool) {
         let weights: Vec<bool> = (0..self.width * self.height).map(used).collect();
         if weights.contains(&true) {
@@ -98,16 +98,22 @@ fn fill(image: &mut RgbImage, known: &[bool]) {
 }
 
 impl RgbImage {
-    /// Colour between the centres of pixels, whole numbers at the centres.
+    /// Bilinear interpolation of the colour; whole numbers are pixel centres.
     fn bilinear(&self, x: f32, y: f32) -> [f32; 3] {
-        let split = |v: f32, size: usize| {
-            let v = v.clamp(0.0, (size - 1) as f32);
-            (v as usize, (v as usize + 1).min(size - 1), v.fract())
-        };
-        let ((x0, x1, u), (y0, y1, v)) = (split(x, self.width), split(y, self.height));
-        let mix = |a: [f32; 3], b: [f32; 3], t: f32| [0, 1, 2].map(|c| a[c] + t * (b[c] - a[c]));
+        let ((x0, x1, u), (y0, y1, v)) = (neighbours(x, self.width), neighbours(y, self.height));
         mix(mix(self.at(x0, y0), self.at(x1, y0), u), mix(self.at(x0, y1), self.at(x1, y1), u), v)
     }
+}
+
+/// The two pixels around a position along an axis, and the weight of the second.
+fn neighbours(v: f32, size: usize) -> (usize, usize, f32) {
+    let v = v.clamp(0.0, (size - 1) as f32);
+    (v as usize, (v as usize + 1).min(size - 1), v.fract())
+}
+
+/// Linear interpolation of colours.
+fn mix(a: [f32; 3], b: [f32; 3], t: f32) -> [f32; 3] {
+    [0, 1, 2].map(|c| a[c] + t * (b[c] - a[c]))
 }
 
 #[cfg(test)]
@@ -140,7 +146,7 @@ mod tests {
         image.fill_from_used(used);
         let row: Vec<f32> = (0..w).map(|x| image.at(x, 15)[0]).collect();
         assert!((0..w).filter(|x| used(*x)).all(|x| row[x] == before.at(x, 15)[0]));
-        // Each end is nearer to its own side: 0.22 and 0.59 here.
+        // Each end is closer to the colour of its own side: 0.22 and 0.59 here.
         assert!(row[9] < 0.35 && row[30] > 0.5, "{row:?}");
         assert!(row.windows(2).all(|p| p[1] >= p[0] - 1e-6 && p[1] - p[0] < 0.16), "no edge: {row:?}");
         let untouched = image.clone();

@@ -1,12 +1,12 @@
-//! Cameras as files state them.
+//! Cameras as files state them, with their distortion.
 use super::{Camera, Lens, Pose};
 use glam::DMat3;
 use serde::{Deserialize, Serialize};
 
-/// A camera with the lens through which its photo was taken.
+/// A camera with the distortion of its photo.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct GivenCamera {
-    /// The pinhole that remains when the lens is taken out.
+    /// Pinhole camera of the undistorted photo.
     pub camera: Camera,
     /// The lens.
     pub lens: Lens,
@@ -19,7 +19,7 @@ impl From<Camera> for GivenCamera {
 }
 
 impl GivenCamera {
-    /// [`Camera::checked`], and refuses lenses whose picture cannot be undone.
+    /// Like [`Camera::checked`]; also refuses distortion that cannot be inverted within the image.
     pub fn checked(self) -> Result<GivenCamera, String> {
         let camera = self.camera.checked()?;
         if !self.lens.is_finite() {
@@ -35,9 +35,9 @@ impl GivenCamera {
         Ok(GivenCamera { camera, ..self })
     }
 
-    /// The camera of the same photo turned by so many quarters clockwise.
+    /// Camera of the same photo turned by `quarters` quarter turns clockwise.
     pub fn turned(&self, quarters: u8) -> GivenCamera {
-        // A quarter sends pixel (x, y) to (height − y, x), and so axis x to y and y to −x.
+        // A quarter turn maps pixel (x, y) to (height − y, x), and so axis x to y and y to −x.
         let quarter = DMat3::from_cols_array(&[0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
         let camera = (0..quarters % 4).fold(self.camera.clone(), |c, _| Camera {
             width: c.height,
@@ -59,7 +59,7 @@ mod tests {
     use glam::{DVec2, DVec3};
 
     #[test]
-    fn a_turned_camera_sees_the_turned_picture() {
+    fn turned_camera_projects_to_turned_pixel() {
         let camera = Camera {
             name: "a".into(),
             width: 640,

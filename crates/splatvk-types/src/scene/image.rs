@@ -26,7 +26,7 @@ impl<T: Copy> Image<T> {
         self.data[y * self.width + x]
     }
 
-    /// The part of a size (width, height) whose first pixel is at column x, row y.
+    /// The part of size (width, height) whose first pixel is at column x, row y.
     pub fn cropped(&self, (x, y): (usize, usize), (width, height): (usize, usize)) -> Image<T> {
         let row = |r: usize| self.data[(y + r) * self.width + x..][..width].iter().copied();
         Image { width, height, data: (0..height).flat_map(row).collect() }
@@ -49,7 +49,7 @@ impl RgbImage {
     pub fn at(&self, x: usize, y: usize) -> [f32; 3] {
         self.data[y * self.width + x]
     }
-    /// Colour of the pixel that holds a continuous position, or of the nearest one.
+    /// Colour of the pixel that contains a continuous position, or of the nearest one.
     pub fn nearest(&self, p: DVec2) -> [f32; 3] {
         self.at((p.x.max(0.0) as usize).min(self.width - 1), (p.y.max(0.0) as usize).min(self.height - 1))
     }
@@ -71,7 +71,7 @@ pub struct DepthMap {
 }
 
 impl DepthMap {
-    /// Makes depth unknown where `keep(index)` does not hold.
+    /// Makes depth unknown where `keep(index)` is false.
     pub fn keep(&mut self, keep: impl Fn(usize) -> bool) {
         for i in (0..self.depth.data.len()).filter(|i| !keep(*i)) {
             (self.depth.data[i], self.confidence.data[i]) = (0.0, 0.0);

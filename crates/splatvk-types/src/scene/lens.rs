@@ -3,8 +3,8 @@ use super::Camera;
 use glam::{DMat2, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
-/// Distortion in normalised camera coordinates: where a lens images the ideal position `x = (X/Z,
-/// Y/Z)`. The coefficients are those of OpenCV and COLMAP, with `r = |x|`:
+/// Distortion in normalised camera coordinates: maps the ideal position `x = (X/Z, Y/Z)` to its
+/// image `x_d`. The coefficients are those of OpenCV and COLMAP, with `r = |x|`:
 ///
 /// - rectilinear: `x_d = x (1 + k1 r² + k2 r⁴ + k3 r⁶)/(1 + k4 r² + k5 r⁴ + k6 r⁶) + q r² + 2 x
 ///   (q·x)` with `q = (p2, p1)` (Brown 1966; `OPENCV`, `FULL_OPENCV`, and with fewer terms
@@ -36,7 +36,7 @@ pub struct Lens {
 }
 
 impl Lens {
-    /// A pinhole.
+    /// No distortion: a pinhole.
     pub const NONE: Lens = Lens::radial(0.0, 0.0);
 
     /// Radial distortion alone.
@@ -44,12 +44,12 @@ impl Lens {
         Lens { k1, k2, k3: 0.0, k4: 0.0, k5: 0.0, k6: 0.0, p1: 0.0, p2: 0.0, fisheye: false }
     }
 
-    /// Whether it changes nothing.
+    /// Whether there is no distortion.
     pub fn is_none(&self) -> bool {
         *self == Lens::NONE
     }
 
-    /// Whether k1 and k2 are all that it has.
+    /// Whether only k1 and k2 are set.
     pub fn is_radial(&self) -> bool {
         *self == Lens::radial(self.k1, self.k2)
     }
@@ -59,7 +59,7 @@ impl Lens {
         [self.k1, self.k2, self.k3, self.k4, self.k5, self.k6, self.p1, self.p2].iter().all(|v| v.is_finite())
     }
 
-    /// The factor of the radius and its derivative by r².
+    /// Factor of the radius and its derivative by r².
     fn scale(&self, r2: f64) -> (f64, f64) {
         if self.fisheye {
             return self.fisheye_scale(r2);
@@ -72,7 +72,7 @@ impl Lens {
     }
 
     fn fisheye_scale(&self, r2: f64) -> (f64, f64) {
-        // The series of θ/r about the axis; the next term is below 1e-16.
+        // Series of θ/r about the axis; the next term is below 1e-16.
         if r2 < 1e-8 {
             return (1.0 + r2 * (self.k1 - 1.0 / 3.0), self.k1 - 1.0 / 3.0);
         }
@@ -86,7 +86,7 @@ impl Lens {
         (image / r, slope / (2.0 * r))
     }
 
-    /// Where the lens images an ideal position.
+    /// Distorted position of an ideal position.
     pub fn distort(&self, x: DVec2) -> DVec2 {
         let r2 = x.length_squared();
         let q = DVec2::new(self.p2, self.p1);
@@ -97,7 +97,7 @@ impl Lens {
     pub fn jacobian(&self, x: DVec2) -> DMat2 {
         let (scale, slope) = self.scale(x.length_squared());
         let q = DVec2::new(self.p2, self.p1);
-        // Column k: the derivative by coordinate k.
+        // Column k is the derivative by coordinate k.
         let column = |axis: DVec2| {
             let along = x.dot(axis);
             axis * (scale + 2.0 * q.dot(x))
@@ -107,20 +107,19 @@ impl Lens {
         DMat2::from_cols(column(DVec2::X), column(DVec2::Y))
     }
 
-    /// The ideal position that the lens images at `y`, by Newton's method. Beyond the radius at
-    /// which radial distortion folds back there is none; the position at the fold is returned
-    /// there.
+    /// Ideal position of the distorted position `y`, by Newton's method. Beyond the radius at which
+    /// radial distortion folds back there is none, and the position at the fold is returned.
     pub fn undistort(&self, y: DVec2) -> DVec2 {
         let target = y.length();
         if self.is_none() || target < 1e-12 {
             return y;
         }
         if !self.is_radial() {
-            return self.undistort_in_the_plane(y);
+            return self.undistort_general(y);
         }
         let mut r = target;
-        // Newton converges quadratically from here; twenty steps are far more than any lens that
-        // can be inverted takes.
+        // Newton converges quadratically from here; twenty steps are far more than any invertible
+        // lens takes.
         for _ in 0..20 {
             let r2 = r * r;
             let slope = 1.0 + r2 * (3.0 * self.k1 + 5.0 * r2 * self.k2);
@@ -140,8 +139,9 @@ impl Lens {
         y * (r / target)
     }
 
-    /// Steps of Newton's method are halved until they lead nearer.
-    fn undistort_in_the_plane(&self, y: DVec2) -> DVec2 {
+    /// Inverts a general distortion by Newton's method in the plane; steps are halved until they
+    /// reduce the error.
+    fn undistort_general(&self, y: DVec2) -> DVec2 {
         // A fisheye images the whole half space within θ = π/2.
         let start = if self.fisheye { y.length().min(1.5).tan() / y.length() } else { 1.0 };
         let mut x = y * start;
@@ -161,35 +161,34 @@ impl Lens {
         x
     }
 
-    /// Where a world point shows in the photo that a camera takes through this lens, pixels.
+    /// Pixel position of a world point in the distorted photo of a camera.
     pub fn project(&self, camera: &Camera, world: DVec3) -> DVec2 {
         let t = camera.pose.transform(world);
         let d = self.distort(t.truncate() / t.z);
         DVec2::new(camera.fx * d.x + camera.cx, camera.fy * d.y + camera.cy)
     }
 
-    /// Camera-frame ray with z = 1 through a pixel position of that photo.
+    /// Camera-frame ray with z = 1 through a pixel position of the distorted photo.
     pub fn ray(&self, camera: &Camera, pixel: DVec2) -> DVec3 {
         self.undistort(camera.ray(pixel).truncate()).extend(1.0)
     }
 
-    /// Whether radial distortion grows with the radius up to `radius` (normalised): beyond a fold
-    /// it cannot be undone.
+    /// Whether radial distortion grows with the radius up to `radius` (normalised); beyond a fold
+    /// it cannot be inverted.
     pub fn is_invertible_to(&self, radius: f64) -> bool {
-        // The derivative is a quadratic in r²; between 0 and the end its least value lies at an end
-        // or at the vertex.
-        let at = |r2: f64| 1.0 + r2 * (3.0 * self.k1 + 5.0 * r2 * self.k2);
+        // The derivative is a quadratic in r²; its minimum between 0 and the end lies at an end or
+        // at the vertex.
+        let slope = |r2: f64| 1.0 + r2 * (3.0 * self.k1 + 5.0 * r2 * self.k2);
         let end = radius * radius;
         let vertex = if self.k2 == 0.0 { end } else { -0.3 * self.k1 / self.k2 };
-        at(end) > 0.0 && (!(0.0..end).contains(&vertex) || at(vertex) > 0.0)
+        slope(end) > 0.0 && (!(0.0..end).contains(&vertex) || slope(vertex) > 0.0)
     }
 
-    /// Whether every position in the picture of a pinhole has one of its own in that of the lens:
-    /// nowhere on the way from the principal point to the edges does the distortion fold back or
-    /// change its sign.
+    /// Whether the distortion is one-to-one within the image of a pinhole: nowhere between the
+    /// principal point and the edges does it fold back or change its sign.
     pub fn is_invertible_in(&self, camera: &Camera) -> bool {
-        // Positions on each edge, and on the way to each of them. What folds between two of them
-        // spans less than a hundredth of the picture.
+        // Samples on each edge, and between the principal point and each of them. A fold between
+        // two samples spans less than a hundredth of the image.
         const STEPS: u32 = 64;
         let (w, h) = (f64::from(camera.width), f64::from(camera.height));
         let share = |k: u32| f64::from(k) / f64::from(STEPS);
@@ -207,9 +206,9 @@ impl Lens {
             })
     }
 
-    /// The same lens for a picture that is turned by so many quarters clockwise.
+    /// Distortion of the image turned by `quarters` quarter turns clockwise.
     pub fn turned(&self, quarters: u8) -> Lens {
-        // q turns with the picture: (x, y) → (−y, x).
+        // q turns with the image: (x, y) → (−y, x).
         (0..quarters % 4).fold(*self, |lens, _| Lens { p2: -lens.p1, p1: lens.p2, ..lens })
     }
 }
@@ -228,6 +227,20 @@ mod tests {
         Lens { k3: 0.001, k4: -0.0005, fisheye: true, ..Lens::radial(0.02, -0.004) },
     ];
 
+    /// A camera of 640 × 480 pixels.
+    fn camera(focal: f64) -> Camera {
+        Camera {
+            name: String::new(),
+            width: 640,
+            height: 480,
+            fx: focal,
+            fy: focal,
+            cx: 320.0,
+            cy: 240.0,
+            pose: crate::scene::Pose::IDENTITY,
+        }
+    }
+
     #[test]
     fn undistort_inverts_distort() {
         for lens in LENSES {
@@ -240,7 +253,7 @@ mod tests {
     }
 
     #[test]
-    fn the_jacobian_is_the_derivative() {
+    fn jacobian_is_derivative() {
         for lens in LENSES {
             let x = DVec2::new(0.31, -0.42);
             for (axis, column) in [(DVec2::X, 0), (DVec2::Y, 1)] {
@@ -280,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn a_lens_turns_with_its_picture() {
+    fn lens_turns_with_picture() {
         for lens in LENSES {
             let x = DVec2::new(0.31, -0.42);
             let turn = |x: DVec2| DVec2::new(-x.y, x.x);
@@ -290,28 +303,18 @@ mod tests {
     }
 
     #[test]
-    fn folds_within_a_picture_are_noticed() {
-        let camera = |focal: f64| Camera {
-            name: String::new(),
-            width: 640,
-            height: 480,
-            fx: focal,
-            fy: focal,
-            cx: 320.0,
-            cy: 240.0,
-            pose: crate::scene::Pose::IDENTITY,
-        };
+    fn fold_within_image_is_not_invertible() {
         // The corner is at r = 400/f, the fold of k1 = −0.5 at 0.816.
         assert!(Lens::radial(-0.5, 0.0).is_invertible_in(&camera(500.0)));
         assert!(!Lens::radial(-0.5, 0.0).is_invertible_in(&camera(480.0)));
         assert!(Lens { fisheye: true, ..Lens::NONE }.is_invertible_in(&camera(100.0)));
-        // A denominator that vanishes on the way, and tangential terms that fold one side.
+        // A denominator that vanishes within the image, and tangential terms that fold one side.
         assert!(!Lens { k4: -2.0, ..Lens::NONE }.is_invertible_in(&camera(400.0)));
         assert!(!Lens { p2: 0.3, ..Lens::NONE }.is_invertible_in(&camera(400.0)));
     }
 
     #[test]
-    fn folds_are_noticed_and_inverted_without_harm() {
+    fn undistort_beyond_fold_is_finite() {
         let fold = Lens::radial(-0.5, 0.0);
         // d(r − r³/2)/dr = 0 at r = 0.816.
         assert!(fold.is_invertible_to(0.81) && !fold.is_invertible_to(0.82));

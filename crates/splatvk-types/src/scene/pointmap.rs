@@ -1,4 +1,5 @@
-//! Output of geometry networks: a 3-D point for every pixel, in the camera of one of a pair.
+//! Output of geometry networks: a 3-D point for every pixel, in the camera frame of one view of a
+//! pair.
 //!
 //! Positions are continuous pixels of the network's input ("model pixels"); the centre of the first
 //! pixel is 0.5.
@@ -6,12 +7,12 @@ use super::{Affine, Camera, Pose, RgbImage};
 use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 
-/// One view as the network saw it.
+/// One view as input of the network.
 #[derive(Clone, Debug)]
 pub struct ModelView {
     /// Name of the photo, for cameras and messages.
     pub name: String,
-    /// Working-resolution photo: output size and colours.
+    /// Working-resolution photo; its size is the output size.
     pub image: RgbImage,
     /// Width of the network's input.
     pub width: usize,
@@ -21,7 +22,7 @@ pub struct ModelView {
     pub from_working: Affine,
     /// Focal length from EXIF in model pixels.
     pub exif_focal: Option<f64>,
-    /// Photos of one camera and size share this number.
+    /// Shared by photos of one camera and size.
     pub camera_group: usize,
 }
 
@@ -31,7 +32,7 @@ impl ModelView {
         DVec2::new(self.width as f64, self.height as f64) * 0.5
     }
 
-    /// Camera of the working-resolution photo, `focal` in model pixels.
+    /// Camera of the working-resolution photo; `focal` in model pixels.
     pub fn working_camera(&self, focal: f64, pose: &Pose) -> Camera {
         let c = self.centre();
         let model = Camera {
@@ -48,11 +49,11 @@ impl ModelView {
     }
 }
 
-/// A point and a confidence per pixel. 1 is none at all; how far above it a good one is depends on
+/// A point and a confidence per pixel. A confidence of 1 means none; the range above it depends on
 /// the network.
 #[derive(Clone, Debug, Default)]
 pub struct Pointmap {
-    /// [H, W] points; OpenCV axes of the camera that the pair names.
+    /// [H, W] points in the OpenCV axes of the camera that the field of the pair names.
     pub points: Vec<[f32; 3]>,
     /// [H, W] confidence ≥ 1.
     pub confidence: Vec<f32>,
@@ -77,7 +78,7 @@ pub struct Descriptors {
 }
 
 impl Descriptors {
-    /// For each of the pixels `rows` the pixel of `other` with the largest dot product; ties go to
+    /// For each of the pixels `rows` the pixel of `other` with the largest dot product; ties take
     /// the lowest.
     pub fn nearest(&self, rows: &[usize], other: &Descriptors) -> Vec<usize> {
         let d = self.dim;
@@ -125,13 +126,13 @@ pub struct PairPointmaps {
 /// Output of a geometry network for a set of photos.
 #[derive(Clone, Debug, Default)]
 pub struct Pointmaps {
-    /// The photos as it saw them.
+    /// Photos as inputs of the network.
     pub views: Vec<ModelView>,
     /// Pointmaps of pairs of them.
     pub pairs: Vec<PairPointmaps>,
-    /// Cameras that it gave for all of them at once, one per view at the size of its input, in the
-    /// unit of the pointmaps; empty when it gives none.
+    /// Cameras that the network estimates jointly, one per view at the size of its input, in the
+    /// unit of the pointmaps; empty where it estimates none.
     pub cameras: Vec<Camera>,
-    /// Least confidence of a usable point on the network's own scale, if that is known.
+    /// Smallest confidence of a usable point on the network's own scale, if known.
     pub confidence_floor: Option<f64>,
 }

@@ -10,7 +10,7 @@ pub struct PointCloud {
     pub colours: Vec<[f32; 3]>,
     /// [N] confidence > 0.
     pub confidence: Vec<f32>,
-    /// [N] index of the view each point came from.
+    /// [N] index of the view of each point.
     pub view: Vec<u8>,
     /// [N] footprint of one pixel at the point's depth, `z / f`, world units.
     pub radius: Vec<f32>,
@@ -21,20 +21,20 @@ impl PointCloud {
     pub fn len(&self) -> usize {
         self.positions.len()
     }
-    /// The points of the given rows, in their order.
+    /// Points of the given rows, in their order.
     pub fn picked(&self, rows: &[usize]) -> PointCloud {
-        fn of<T: Copy>(all: &[T], rows: &[usize]) -> Vec<T> {
+        fn rows_of<T: Copy>(all: &[T], rows: &[usize]) -> Vec<T> {
             rows.iter().map(|i| all[*i]).collect()
         }
         PointCloud {
-            positions: of(&self.positions, rows),
-            colours: of(&self.colours, rows),
-            confidence: of(&self.confidence, rows),
-            view: of(&self.view, rows),
-            radius: of(&self.radius, rows),
+            positions: rows_of(&self.positions, rows),
+            colours: rows_of(&self.colours, rows),
+            confidence: rows_of(&self.confidence, rows),
+            view: rows_of(&self.view, rows),
+            radius: rows_of(&self.radius, rows),
         }
     }
-    /// Adds the points of another cloud behind these.
+    /// Appends the points of another cloud.
     pub fn append(&mut self, mut other: PointCloud) {
         self.positions.append(&mut other.positions);
         self.colours.append(&mut other.colours);

@@ -1,4 +1,4 @@
-//! Depth that is suggested, not measured.
+//! Depth priors: estimates of networks, not measurements.
 use super::Image;
 use serde::{Deserialize, Serialize};
 
@@ -11,11 +11,11 @@ pub enum PriorKind {
     InverseDepth,
 }
 
-/// A depth map of unknown scale and shift, as a network sees one photo. It covers the whole photo,
-/// at any resolution.
+/// A depth map of unknown scale and shift, as a network estimates it from one photo. It covers the
+/// whole photo, at any resolution.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DepthPrior {
-    /// [H, W] values; 0 or less and what is not finite = unknown.
+    /// [H, W] values; unknown where not positive or not finite.
     pub values: Image<f32>,
     /// Their kind.
     pub kind: PriorKind,

@@ -3,8 +3,7 @@
 use crate::scene::{Image, RgbImage};
 use rayon::prelude::*;
 
-/// Per output index: the first input index and the weights of it and its successors, which sum to
-/// 1.
+/// Per output index: the first input index and the weights from there on, which sum to 1.
 fn footprints(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let step = from as f64 / to as f64;
     (0..to)
@@ -44,8 +43,8 @@ pub fn area_average(
     RgbImage { width: to.0, height: to.1, data }
 }
 
-/// [`area_average`] of pixels with the share of each that is used; also [H, W] the share that is
-/// used of every output pixel. Where that is 0, the colour goes on smoothly from the others.
+/// [`area_average`] of pixels with their used shares; also returns the [H, W] used share of every
+/// output pixel. Where that is 0, the colour continues the others smoothly.
 pub fn area_average_of_used(
     from: (usize, usize),
     to: (usize, usize),
@@ -56,7 +55,7 @@ pub fn area_average_of_used(
         colour.map(|v| v * share)
     });
     let share = area_average(from, to, |x, y| [pixel(x, y).1; 3]);
-    // A little more than 1 by rounding.
+    // Rounding may exceed 1 slightly.
     let share = Image { width: to.0, height: to.1, data: share.data.iter().map(|s| s[0].min(1.0)).collect() };
     for (colour, share) in image.data.iter_mut().zip(&share.data).filter(|(_, share)| **share > 0.0) {
         *colour = colour.map(|v| v / share);
@@ -74,15 +73,13 @@ impl Image<f32> {
 }
 
 impl RgbImage {
-    /// The image at another size by area averaging: exact for down-scaling; enlarging repeats
-    /// pixels.
+    /// Resizes by area averaging: exact for down-scaling; enlarging repeats pixels.
     pub fn resized_by_area(&self, width: usize, height: usize) -> RgbImage {
         area_average((self.width, self.height), (width, height), |x, y| self.at(x, y))
     }
 }
 
-/// The shape of a resampling filter; its width grows with the reduction (as Pillow's `resize`
-/// does).
+/// Resampling filter; its width grows with the reduction, as in Pillow's `resize`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Kernel {
@@ -105,9 +102,6 @@ impl Kernel {
 
     fn weight(self, x: f64) -> f64 {
         let x = x.abs();
-        let sinc = |x: f64| {
-            if x == 0.0 { 1.0 } else { (std::f64::consts::PI * x).sin() / (std::f64::consts::PI * x) }
-        };
         match self {
             _ if x >= self.reach() => 0.0,
             Kernel::Triangle => 1.0 - x,
@@ -120,22 +114,26 @@ impl Kernel {
     /// Per output index: the first input index and the weights from there on, which sum to 1.
     fn taps(self, from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
         let step = from as f64 / to as f64;
-        let wide = step.max(1.0);
-        let one = |i: usize| {
-            let centre = (i as f64 + 0.5) * step;
-            let first = ((centre - self.reach() * wide + 0.5).max(0.0) as usize).min(from - 1);
-            let last = ((centre + self.reach() * wide + 0.5) as usize).clamp(first + 1, from);
-            let raw: Vec<f64> =
-                (first..last).map(|j| self.weight((j as f64 + 0.5 - centre) / wide)).collect();
-            let sum: f64 = raw.iter().sum();
-            (first, raw.into_iter().map(|w| (w / sum) as f32).collect())
-        };
-        (0..to).map(one).collect()
+        (0..to).map(|i| self.tap((i as f64 + 0.5) * step, step.max(1.0), from)).collect()
+    }
+
+    /// First input index and weights around `centre`, for a filter widened by `wide`.
+    fn tap(self, centre: f64, wide: f64, from: usize) -> (usize, Vec<f32>) {
+        let first = ((centre - self.reach() * wide + 0.5).max(0.0) as usize).min(from - 1);
+        let last = ((centre + self.reach() * wide + 0.5) as usize).clamp(first + 1, from);
+        let raw: Vec<f64> = (first..last).map(|j| self.weight((j as f64 + 0.5 - centre) / wide)).collect();
+        let sum: f64 = raw.iter().sum();
+        (first, raw.into_iter().map(|w| (w / sum) as f32).collect())
     }
 }
 
+/// `sin(πx) / (πx)`.
+fn sinc(x: f64) -> f64 {
+    if x == 0.0 { 1.0 } else { (std::f64::consts::PI * x).sin() / (std::f64::consts::PI * x) }
+}
+
 impl RgbImage {
-    /// The image at another size; positions keep their share of the width and height.
+    /// Resizes with a filter; positions keep their share of the width and height.
     pub fn resized(&self, width: usize, height: usize, kernel: Kernel) -> RgbImage {
         let (columns, rows) = (kernel.taps(self.width, width), kernel.taps(self.height, height));
         let mut narrow = vec![[0f32; 3]; width * self.height];
@@ -175,7 +173,7 @@ mod tests {
     const ROUNDING: f32 = 1e-4;
 
     #[test]
-    fn whole_boxes_take_the_value_at_their_centre() {
+    fn area_average_of_ramp_is_centre() {
         let small = ramp(36, 24).resized_by_area(9, 6);
         for y in 0..6 {
             for x in 0..9 {

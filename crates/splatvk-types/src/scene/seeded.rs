@@ -18,9 +18,9 @@ pub fn camera(width: u32, height: u32, pose: Pose) -> Camera {
     }
 }
 
-/// The benchmark scene: N splats spread evenly over the image at depths 2–6, about 34–43 blended
-/// per pixel at 50 000 splats and 480×360, whatever N and the size (the footprint shrinks with √N).
-/// Camera at the origin.
+/// Benchmark scene: N splats spread evenly over the image at depths 2–6, about 34–43 blended per
+/// pixel at 50 000 splats and 480×360, whatever N and the size (the footprint shrinks with √N). The
+/// camera is at the origin.
 pub fn benchmark(n: usize, width: u32, height: u32, sh_degree: u32, seed: u64) -> (Splats, Camera) {
     let camera = camera(width, height, Pose::IDENTITY);
     let mut random = Random::new(seed);

@@ -1,13 +1,13 @@
-//! How much of the photos every splat shows. What no photo shows is a guess: a surface continued
-//! beyond the photos' borders and behind what stands in front, or the inside of a thing.
+//! How many pixels of the photos every splat covers. Splats without any are guesses: a surface
+//! continued beyond the photos' borders or behind a nearer one, or the inside of a thing.
 use super::Splats;
 
-/// Splats that show less of the photos than this, in pixels, are unseen: they leave no trace in any
-/// photo. The bound below which a splat starts without a feature, too
+/// Splats that cover less of the photos than this, in pixels, are unseen: they leave no trace in
+/// any photo. Below this bound a splat also starts without a feature
 /// (docs/internals/method.md#lifting).
-const LEAST: f32 = 0.05;
+const MIN_PIXELS: f32 = 0.05;
 
-/// What the photos show of every splat; nothing where that is not known, as of a bare file of
+/// Blending weight of every splat in the photos; empty where unknown, as for a bare file of
 /// Gaussians.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Seen {
@@ -16,12 +16,12 @@ pub struct Seen {
 }
 
 impl Seen {
-    /// Whether no photo shows a splat; false where that is not known.
+    /// Whether no photo shows a splat; false where unknown.
     pub fn is_unseen(&self, splat: usize) -> bool {
-        self.pixels.get(splat).is_some_and(|p| *p < LEAST)
+        self.pixels.get(splat).is_some_and(|p| *p < MIN_PIXELS)
     }
 
-    /// How many splats no photo shows.
+    /// Number of splats that no photo shows.
     pub fn unseen(&self) -> usize {
         (0..self.pixels.len()).filter(|i| self.is_unseen(*i)).count()
     }
@@ -48,7 +48,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_not_known_is_not_called_unseen() {
+    fn unknown_coverage_is_not_unseen() {
         let splats = Splats { means: vec![[0.0; 3]; 3], ..Splats::default() };
         let seen = Seen { pixels: vec![3.0, 0.01, 0.0] };
         assert_eq!((seen.unseen(), seen.rows(&splats)), (2, vec![0]));
@@ -56,7 +56,7 @@ mod tests {
     }
 
     #[test]
-    fn what_photos_show_least_goes_first() {
+    fn most_shown_keeps_largest_weights() {
         let splats = Splats { means: vec![[0.0; 3]; 4], ..Splats::default() };
         let seen = Seen { pixels: vec![0.5, 3.0, 0.0, 1.0] };
         assert_eq!(seen.most_shown(&splats, 2), [1, 3]);

@@ -1,15 +1,15 @@
 //! Real spherical harmonics up to degree 3, in the order and with the signs that all 3DGS files use
-//! (docs/internals/method.md#splat-parameters; twin of `glsl/shared/sh.glsl`).
+//! (docs/internals/method.md#splat-parameters; reference of `glsl/shared/sh.glsl`).
 use glam::DVec3;
 
-/// Degree 0.
+/// Constant of degree 0.
 pub const C0: f64 = 0.28209479177387814;
-/// Degree 1.
+/// Constant of degree 1.
 pub const C1: f64 = 0.4886025119029199;
-/// Degree 2.
+/// Constants of degree 2.
 pub const C2: [f64; 5] =
     [1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396];
-/// Degree 3.
+/// Constants of degree 3.
 pub const C3: [f64; 7] = [
     -0.5900435899266435,
     2.890611442640554,

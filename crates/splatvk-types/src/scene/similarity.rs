@@ -1,4 +1,4 @@
-//! Moving between world frames of different scale.
+//! Similarity transforms between world frames of different scale.
 use super::{Camera, Pose};
 use glam::{DMat3, DVec3};
 
@@ -14,12 +14,12 @@ pub struct Similarity {
 }
 
 impl Similarity {
-    /// The image of a point.
+    /// Transforms a point.
     pub fn transform(&self, p: DVec3) -> DVec3 {
         self.rotation * p * self.scale + self.translation
     }
 
-    /// The camera that sees moved points where `camera` saw them.
+    /// Camera with the same image of the transformed points as `camera` has of the original ones.
     pub fn camera(&self, camera: &Camera) -> Camera {
         let rotation = camera.pose.rotation * self.rotation.transpose();
         let translation = camera.pose.translation * self.scale - rotation * self.translation;
@@ -33,7 +33,7 @@ mod tests {
     use glam::DVec2;
 
     #[test]
-    fn a_moved_camera_sees_moved_points_where_they_were() {
+    fn similarity_camera_keeps_pixels() {
         let pose = Pose::exp(DVec3::new(0.3, 1.0, -2.0), DVec3::new(0.1, -0.8, 0.4));
         let camera = Camera {
             name: "a".into(),

@@ -26,12 +26,12 @@ pub struct Splats {
     pub sh: Vec<f32>,
     /// Whether opacities are meant with the 2-D Mip filter (Yu et al. 2024, Mip-Splatting): where
     /// the projection dilates a splat, its opacity falls by the square root of the ratio of the
-    /// determinants, so that thin splats do not grow heavier.
+    /// determinants, so that thin splats keep their total weight.
     pub antialiased: bool,
 }
 
 impl Splats {
-    /// No Gaussians of an SH degree, and room for `n`.
+    /// No Gaussians, with capacity for `n` of an SH degree.
     pub fn with_capacity(n: usize, sh_degree: u32) -> Splats {
         Splats {
             means: Vec::with_capacity(n),
@@ -51,7 +51,7 @@ impl Splats {
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }
-    /// Adds the rows of `other`, which must have the same SH degree and the same filter.
+    /// Appends the rows of `other`, which must have the same SH degree and the same filter.
     pub fn append(&mut self, mut other: Splats) {
         debug_assert_eq!((self.sh_degree, self.antialiased), (other.sh_degree, other.antialiased));
         self.means.append(&mut other.means);

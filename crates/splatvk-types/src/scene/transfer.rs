@@ -1,8 +1,8 @@
-//! The sRGB transfer (IEC 61966-2-1), continued above 1 by the same formula: colours of high
-//! dynamic range keep their order and come back exactly, while everything up to 1 is as in an 8-bit
+//! sRGB transfer function (IEC 61966-2-1), continued above 1 by the same formula: colours of high
+//! dynamic range keep their order and survive a round trip, while values up to 1 are as in an 8-bit
 //! photo.
 
-/// Encoded value to linear light; odd, so that values below 0 come back too.
+/// Encoded value to linear light; an odd function, so that negative values survive, too.
 pub fn to_linear(v: f32) -> f32 {
     let a = v.abs();
     let linear = if a <= 0.04045 { a / 12.92 } else { ((a + 0.055) / 1.055).powf(2.4) };
@@ -21,7 +21,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_transfer_goes_both_ways_and_beyond_one() {
+    fn srgb_transfer_inverts_beyond_one() {
         // IEC 61966-2-1: mid grey 0.5 is 0.21404 linear.
         assert!((to_linear(0.5) - 0.214_041).abs() < 1e-5);
         assert!((to_linear(1.0) - 1.0).abs() < 1e-6 && (to_srgb(1.0) - 1.0).abs() < 1e-6);

@@ -1,4 +1,5 @@
-//! How a scene's own coordinates lie in the world: which way is up, and how long its unit is.
+//! Orientation and scale of a scene's coordinates in the world: the direction up, and metres per
+//! unit.
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
@@ -11,14 +12,14 @@ pub enum UpEvidence {
     Accelerometer,
     /// Edges of the photos that are upright in the scene.
     VerticalEdges,
-    /// A table, a floor, the ground.
+    /// A horizontal surface: a table, a floor, the ground.
     LevelSurface,
     /// Cameras are held without much roll.
     CameraRoll,
 }
 
 impl UpEvidence {
-    /// For people.
+    /// Name in messages and reports.
     pub fn text(self) -> &'static str {
         match self {
             UpEvidence::Accelerometer => "accelerometer",
@@ -36,26 +37,25 @@ pub struct Up {
     pub direction: DVec3,
     /// One standard deviation about the least certain axis, degrees.
     pub sigma_degrees: f64,
-    /// The evidence that agrees.
+    /// The evidence that supports the direction.
     pub evidence: Vec<UpEvidence>,
 }
 
-/// How long the scene's unit is.
+/// Length of the scene's unit.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Scale {
     /// Metres.
     pub metres_per_unit: f64,
     /// One standard deviation of its logarithm.
     pub log_sigma: f64,
-    /// The lengths that were stated, as they were written.
+    /// The stated lengths, as the user wrote them.
     pub stated: Vec<String>,
 }
 
-/// Direction up and scale of a scene, as far as they are known. The scene keeps its own
-/// coordinates.
+/// Direction up and scale of a scene, where known. The scene keeps its own coordinates.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct World {
-    /// `None` where nothing tells it surely.
+    /// `None` where the evidence is not sufficient.
     #[serde(default)]
     pub up: Option<Up>,
     /// `None` until a length is stated.
@@ -66,16 +66,16 @@ pub struct World {
 /// The axis that points up in coordinates outside the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum UpAxis {
-    /// −y: right, down, forward, as cameras and files of Gaussians have it.
+    /// −y: right, down, forward, as in cameras and files of Gaussians.
     MinusY,
-    /// +y: right, up, back, as glTF has it.
+    /// +y: right, up, back, as in glTF.
     PlusY,
-    /// +z: right, forward, up, as maps and nerfstudio have it.
+    /// +z: right, forward, up, as in maps and nerfstudio.
     PlusZ,
 }
 
 impl UpAxis {
-    /// From right, down, forward.
+    /// Rotation from right, down, forward.
     fn turn(self) -> DMat3 {
         match self {
             UpAxis::MinusY => DMat3::IDENTITY,
@@ -86,8 +86,8 @@ impl UpAxis {
 }
 
 impl Up {
-    /// Scene axes → axes with `axis` up; beyond that the smallest turn, so that forward stays
-    /// forward.
+    /// Rotation from scene axes to axes with `axis` up; the smallest one beyond the change of axes,
+    /// so that forward stays forward.
     pub fn levelled(&self, axis: UpAxis) -> DMat3 {
         axis.turn()
             * DMat3::from_quat(DQuat::from_rotation_arc(
@@ -102,7 +102,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn up_goes_to_the_axis_and_forward_stays() {
+    fn levelled_up_keeps_forward() {
         let direction = DVec3::new(0.1, -0.9, -0.3).normalize();
         let up = Up { direction, sigma_degrees: 1.0, evidence: Vec::new() };
         for (axis, to, ahead) in [
@@ -114,7 +114,7 @@ mod tests {
             assert!((turn * direction - to).length() < 1e-12, "{axis:?}");
             assert!((turn.determinant() - 1.0).abs() < 1e-12 && (turn * DVec3::Z).dot(ahead) > 0.9);
         }
-        // Upside down there is no smallest turn; any will do.
+        // Upside down there is no unique smallest rotation; any will do.
         let down = Up { direction: DVec3::Y, sigma_degrees: 1.0, evidence: Vec::new() };
         assert!((down.levelled(UpAxis::MinusY) * DVec3::Y - DVec3::NEG_Y).length() < 1e-12);
     }

@@ -1,10 +1,9 @@
-//! Files that are of another format than their names say, or of one that is not read: what they
-//! are, and the way out.
+//! Files whose format differs from their name, or is not supported: detection and advice.
 use crate::{Error, files};
 use std::io::Read as _;
 use std::path::Path;
 
-/// Endings of other programs' files, and what to do with them.
+/// Endings of other programs' files, with advice.
 const OTHERS: [(&str, &str); 14] = [
     (".ksplat", "a .ksplat is of GaussianSplats3D: export the .ply that it was made from"),
     (".sog", "a .sog is of PlayCanvas: splat-transform turns it into a .ply"),
@@ -28,13 +27,13 @@ const OTHERS: [(&str, &str); 14] = [
     (".zip", "unpack it and give the file inside"),
 ];
 
-/// The way out for a name.
+/// Advice for a file name.
 pub(super) fn named(path: &Path) -> Option<&'static str> {
     let name = path.file_name()?.to_string_lossy().to_lowercase();
     OTHERS.iter().find(|(ending, _)| name.ends_with(ending)).map(|(_, advice)| *advice)
 }
 
-/// What a file is by its first bytes.
+/// Format of a file by its first bytes.
 fn content(path: &Path) -> Option<&'static str> {
     let mut start = Vec::new();
     files::open(path).ok()?.0.take(16).read_to_end(&mut start).ok()?;
@@ -48,10 +47,10 @@ fn content(path: &Path) -> Option<&'static str> {
     Some(name)
 }
 
-/// The error of a file that is of another format than its name says: `format` with `ending`.
+/// Error for a file whose content is of another format than `format` with `ending`.
 pub(super) fn misnamed(path: &Path, format: &str, ending: &str) -> Option<Error> {
     let name = content(path)?;
-    // A .glb may be named .gltf, and a compressed .ply as a plain one: their readers are the same.
+    // A .glb may be named .gltf, and a compressed .ply like a plain one: they share a reader.
     if ending.ends_with(&format!(".{name}")) || (name, format) == ("glb", "gltf") {
         return None;
     }

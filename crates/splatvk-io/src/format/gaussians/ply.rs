@@ -12,9 +12,9 @@ use crate::{Error, Result, files};
 use std::fmt::Write as _;
 use std::path::Path;
 
-/// Reads Gaussians in the INRIA layout, of any SH degree 0–3 (of degree 4 without band 4), and of
-/// other programs what is close to it; notes name what is not read, a line each. ASCII or binary.
-/// Compressed files as SuperSplat writes them are understood, too.
+/// Reads Gaussians in the INRIA layout, of SH degree 0–3 (of degree 4 without band 4), and similar
+/// layouts of other programs; notes name parts that are not read, a line each. ASCII or binary.
+/// Compressed files of SuperSplat are supported, too.
 pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
     let mut parse = |bytes: Vec<u8>| {
         if ply_packed::is_packed(&header(&bytes, "vertex")?.columns) {
@@ -25,25 +25,25 @@ pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
     parse(files::read(path)?).map_err(|what| Error::input(format!("{}: {what}", path.display())))
 }
 
-/// [`read_noted`] of a file that this program wrote.
+/// Like [`read_noted`], for a file of this program.
 pub fn read_splats(path: &Path) -> Result<Splats> {
     read_noted(path, &mut Vec::new())
 }
 
 fn gaussians(t: &Table, notes: &mut Vec<String>) -> Result<Splats, String> {
-    let need = |missing: String| {
+    let no_column = |missing: String| {
         let has = files::listed(&t.names());
         format!("no column {missing}: this is not a Gaussian splat file of the INRIA layout; it has {has}")
     };
-    let position = t.all(["x", "y", "z"]).map_err(need)?;
-    let [opacity] = t.all(["opacity"]).map_err(need)?;
-    let scale = scales(t, notes).map_err(need)?;
-    let rotation = t.all(["rot_0", "rot_1", "rot_2", "rot_3"]).map_err(need)?;
+    let position = t.all(["x", "y", "z"]).map_err(no_column)?;
+    let [opacity] = t.all(["opacity"]).map_err(no_column)?;
+    let scale = scales(t, notes).map_err(no_column)?;
+    let rotation = t.all(["rot_0", "rot_1", "rot_2", "rot_3"]).map_err(no_column)?;
     let dc = t.all(["f_dc_0", "f_dc_1", "f_dc_2"]);
-    // nerfstudio writes colours in the place of the coefficients where it is asked to.
+    // nerfstudio optionally writes colours in place of the coefficients.
     let colours = if dc.is_err() { Colours::of(t, notes)? } else { None };
     if let (Err(missing), None) = (&dc, &colours) {
-        return Err(need(missing.clone()));
+        return Err(no_column(missing.clone()));
     }
     let rest = t.series("f_rest_")?;
     let (degree, stored) = sh_degree(rest.len(), notes)?;
@@ -73,7 +73,7 @@ fn gaussians(t: &Table, notes: &mut Vec<String>) -> Result<Splats, String> {
     notes.extend(ply_comments::places(&t.comments));
     s.antialiased = ply_comments::antialiased(&t.comments, notes)?;
     if filter.is_some() {
-        // Mip-Splatting draws with both of its filters.
+        // Mip-Splatting renders with both of its filters.
         s.antialiased = true;
         notes.push(format!(
             "the 3-D filter of Mip-Splatting ({FILTER}) is worked into scales and opacities; its screen filter of 0.1 px² is \
@@ -86,11 +86,12 @@ fn gaussians(t: &Table, notes: &mut Vec<String>) -> Result<Splats, String> {
     Ok(s)
 }
 
-/// Columns that are read, but for those of the colours.
+/// Columns that are read, except those of the colours.
 const COLUMNS: [&str; 12] =
     ["x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", FILTER];
 
-/// The columns of the scales: three, or two of 2-D Gaussians (Huang et al. 2024), whose third is 0.
+/// Columns of the scales: three, or two of 2-D Gaussians (Huang et al. 2024), whose third scale is
+/// 0.
 fn scales(t: &Table, notes: &mut Vec<String>) -> Result<Vec<usize>, String> {
     if let ([_, _], None) = (t.all(["scale_0", "scale_1"])?, t.column("scale_2")) {
         notes.push(
@@ -105,7 +106,7 @@ fn scales(t: &Table, notes: &mut Vec<String>) -> Result<Vec<usize>, String> {
 /// Column of the 3-D smoothing filter of Mip-Splatting: a standard deviation per Gaussian.
 const FILTER: &str = "filter_3D";
 
-/// Works a 3-D filter of standard deviation f into a Gaussian (Yu et al. 2024, eq. 9): s' = √(s² +
+/// Folds a 3-D filter of standard deviation f into a Gaussian (Yu et al. 2024, eq. 9): s' = √(s² +
 /// f²), o' = o ∏ s / s'.
 fn fold(log_scales: &mut [f32; 3], logit: &mut f32, filter: f32) {
     let (mut log_ratio, variance) = (0.0, f64::from(filter).powi(2));
@@ -119,14 +120,14 @@ fn fold(log_scales: &mut [f32; 3], logit: &mut f32, filter: f32) {
     *logit = crate::format::logit(opacity as f32);
 }
 
-/// How [`write_splats`] writes.
+/// Options of [`write_splats`].
 #[derive(Clone, Copy, Debug)]
 pub struct PlyOptions<'a> {
-    /// SH degree of the file: higher coefficients are zero, lower degrees cut them. INRIA's own
-    /// loader asks for 3.
+    /// SH degree of the file: missing coefficients are zero, coefficients above it are cut. INRIA's
+    /// own loader requires 3.
     pub degree: u32,
-    /// Adds unit features and code indices per level after all standard columns; viewers skip what
-    /// they do not know.
+    /// Appends unit features and code indices per level after all standard columns; viewers skip
+    /// unknown columns.
     pub language: Option<&'a LanguageField>,
 }
 
@@ -219,7 +220,7 @@ fn splat_header(s: &Splats, rest: usize, levels: &[(&str, &LevelField)]) -> Stri
     h
 }
 
-/// The unit feature of splat i; zero where the raw feature is zero.
+/// Unit feature of splat i; zero where the raw feature is zero.
 fn unit(level: &LevelField, i: usize) -> Vec<f32> {
     let d = level.codebook.code_dim;
     let raw = &level.features[i * d..(i + 1) * d];
@@ -240,7 +241,8 @@ fn nearest_code(level: &LevelField, i: usize) -> i32 {
 mod tests {
     use super::*;
 
-    /// A text file of one Gaussian with these columns, all 0.5 but the last one, which is `last`.
+    /// A text file of one Gaussian with these columns, all 0.5 except the last one, which is
+    /// `last`.
     fn read(comments: &str, columns: &str, last: f32) -> Result<(Splats, Vec<String>)> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ply");
@@ -309,7 +311,7 @@ mod tests {
     }
 
     #[test]
-    fn columns_that_are_not_read_are_named() {
+    fn unread_columns_are_noted() {
         let (_, notes) = read("comment Vertical Axis: z\n", &with("nx semantic_0 label"), 1.0).unwrap();
         assert!(notes.iter().any(|n| n.ends_with("not read: columns semantic_0, label")), "{notes:?}");
         assert!(notes.iter().any(|n| n.contains("Vertical Axis: z")) && notes.len() == 2, "{notes:?}");

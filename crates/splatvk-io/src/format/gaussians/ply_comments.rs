@@ -1,6 +1,6 @@
-//! What comments in the header of a PLY file say about its numbers.
+//! Comments in the header of a PLY file that change the meaning of its numbers.
 
-/// How opacities are meant.
+/// Meaning of the opacities.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Mode {
     Plain,
@@ -10,8 +10,8 @@ enum Mode {
     Flat,
 }
 
-/// What the comments state: `SplatRenderMode: mip` (Brush, SuperSplat), `antialiased 1` (Postshot)
-/// and the like. Returns whether the Gaussians are antialiased; notes name what is stated and not
+/// Whether the comments state that the Gaussians are antialiased: `SplatRenderMode: mip` (Brush,
+/// SuperSplat), `antialiased 1` (Postshot) and the like. Notes name statements that are not
 /// applied.
 pub(super) fn antialiased(comments: &[String], notes: &mut Vec<String>) -> Result<bool, String> {
     let mut stated: Vec<(Mode, &str)> = Vec::new();
@@ -36,17 +36,17 @@ pub(super) fn antialiased(comments: &[String], notes: &mut Vec<String>) -> Resul
     Ok(first.is_some_and(|(mode, _)| *mode == Mode::Antialiased))
 }
 
-/// Names comments on axes, units and places in the world: coordinates are read as they stand.
+/// Notes on comments about axes, units and georeference: they are not applied.
 pub(super) fn places(comments: &[String]) -> impl Iterator<Item = String> {
     let stated = comments.iter().filter(|text| is_place(&split(text).0));
     stated.map(|text| format!("its comment {text:?} is not applied: coordinates are read as they stand"))
 }
 
-/// The comment that [`antialiased`] reads, as Brush and SuperSplat write it.
+/// Comment that [`antialiased`] reads, as Brush and SuperSplat write it.
 pub(super) const MIP: &str = "comment SplatRenderMode: mip\n";
 
-/// Lower-case letters and digits of what stands before the first colon, equals sign or value, and
-/// what stands after it.
+/// Key, in lower-case letters and digits, before the first colon, equals sign or blank, and the
+/// value after it.
 fn split(text: &str) -> (String, String) {
     let text = text.to_lowercase();
     let (key, value) = match text.split_once([':', '=']) {
@@ -81,7 +81,7 @@ fn mode(value: &str) -> Option<Mode> {
     })
 }
 
-/// Keys of axes, units and places in the world.
+/// Whether a key is about axes, units or georeference.
 fn is_place(key: &str) -> bool {
     const STARTS: [&str; 12] = [
         "verticalaxis",
@@ -97,7 +97,7 @@ fn is_place(key: &str) -> bool {
         "unit",
         "translation",
     ];
-    // "up" alone: "updated on …" is about something else.
+    // "up" must match completely: "updated on …" is unrelated.
     STARTS.iter().any(|start| if *start == "up" { key == *start } else { key.starts_with(start) })
         || matches!(key, "scale" | "globalscale" | "globalshift" | "localorigin")
 }

@@ -1,4 +1,4 @@
-//! Headers of PLY files: elements, their properties, and the comments in front of them.
+//! Headers of PLY files: elements, their properties, and comments.
 use std::collections::HashSet;
 
 /// Type of a property.
@@ -39,7 +39,7 @@ impl PropertyType {
         }
     }
 
-    /// `bytes` holds exactly this kind's size; `N` extra bytes are never read.
+    /// Value in `bytes`, which begins with this type; bytes beyond its size are not read.
     pub fn value(self, bytes: &[u8], little: bool) -> f64 {
         let mut raw = [0u8; 8];
         let size = self.size();
@@ -60,14 +60,14 @@ impl PropertyType {
     }
 }
 
-/// Most columns of an element. Names of 4,096 take no time to look through; Gaussians with features
-/// have some hundreds.
+/// Largest number of columns of an element: a linear search over 4,096 names is fast, and Gaussians
+/// with features have some hundreds.
 const MOST_COLUMNS: usize = 4096;
 
-/// Most bytes before the values: those of 4,096 columns with long names.
+/// Largest header, bytes: 4,096 columns with long names.
 const LONGEST_HEADER: usize = 1 << 20;
 
-/// What a file states about one of its elements, and what else it has.
+/// Header of a file with respect to one of its elements.
 #[derive(Debug)]
 pub(super) struct Header {
     pub ascii: bool,
@@ -84,9 +84,9 @@ pub(super) struct Header {
     pub elements: Vec<String>,
 }
 
-/// The lines of a header up to `end_header`, and the first byte after it. The first line decides
-/// whether a carriage return alone ends a line: elsewhere the byte after `end_header\r` could be a
-/// value that looks like a line feed.
+/// Lines of a header up to `end_header`, and the first byte after it. The first line decides
+/// whether a carriage return alone ends a line: in other files the byte after `end_header\r` could
+/// be a value equal to a line feed.
 fn lines(bytes: &[u8]) -> Result<(Vec<String>, usize), String> {
     let mark = if bytes.starts_with(b"\xef\xbb\xbf") { 3 } else { 0 };
     let bytes = &bytes[mark..];
@@ -111,7 +111,7 @@ fn lines(bytes: &[u8]) -> Result<(Vec<String>, usize), String> {
     }
 }
 
-/// Reads the header with an eye on the element `wanted`.
+/// Reads the header and the layout of the element `wanted`.
 pub(super) fn header(bytes: &[u8], wanted: &str) -> Result<Header, String> {
     let (lines, body) = lines(bytes)?;
     let mut h = Header {
@@ -173,7 +173,7 @@ struct Element {
 }
 
 impl Element {
-    /// Takes the words after "property".
+    /// Adds a property, given the words after "property".
     fn add(&mut self, property: &[&str]) -> Result<(), String> {
         match property {
             ["list", ..] => self.has_list = true,
@@ -190,7 +190,7 @@ impl Element {
         Ok(())
     }
 
-    /// Refuses rows that are not of one length, and columns that cannot be told apart.
+    /// Refuses rows of varying length, and duplicate column names.
     fn check(&self) -> Result<(), String> {
         let name = &self.name;
         if self.has_list {
@@ -207,7 +207,7 @@ impl Element {
         }
     }
 
-    /// Bytes (binary) or lines (ASCII).
+    /// Length in bytes (binary) or lines (ASCII).
     fn length(&self, ascii: bool) -> Result<usize, String> {
         if ascii || self.rows == 0 {
             return Ok(self.rows);
@@ -249,7 +249,7 @@ mod tests {
     #[test]
     fn every_line_ending_is_read() {
         let text = format!("ply\nformat binary_little_endian 1.0\n{COLUMN}end_header\n");
-        // The value is a line feed: it must not be taken for part of a line ending.
+        // The value is a line feed: it must not be read as part of a line ending.
         for (ending, blanks) in [("\n", ""), ("\r\n", ""), ("\r", ""), ("\n", " \t"), ("\r\n", "  ")] {
             let text = text.replace('\n', &format!("{blanks}{ending}")) + "\n";
             let (h, body) = read(&text).unwrap();
@@ -261,10 +261,10 @@ mod tests {
 
     #[test]
     fn ambiguous_headers_are_refused() {
-        let with = |lines: &str| read(&format!("ply\nformat ascii 1.0\n{lines}end_header\n")).unwrap_err();
-        assert!(with(&format!("{COLUMN}property float a\n")).contains("property a twice"));
-        assert!(with(&format!("{COLUMN}element vertex 3\n")).contains("two elements vertex"));
-        assert!(with(&format!("{COLUMN}property list uchar int b\n")).contains("list property"));
+        let refusal = |lines: &str| read(&format!("ply\nformat ascii 1.0\n{lines}end_header\n")).unwrap_err();
+        assert!(refusal(&format!("{COLUMN}property float a\n")).contains("property a twice"));
+        assert!(refusal(&format!("{COLUMN}element vertex 3\n")).contains("two elements vertex"));
+        assert!(refusal(&format!("{COLUMN}property list uchar int b\n")).contains("list property"));
         let list = "element face 2\nproperty list uchar int b\n";
         assert!(read(&format!("ply\nformat ascii 1.0\n{list}{COLUMN}end_header\n")).is_ok());
         let binary = format!("ply\nformat binary_little_endian 1.0\n{list}{COLUMN}end_header\n");

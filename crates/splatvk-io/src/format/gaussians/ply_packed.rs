@@ -1,5 +1,5 @@
-//! Compressed PLY as SuperSplat writes it: chunks of 256 Gaussians with their bounds, each Gaussian
-//! in four 32-bit words, SH in bytes. About a quarter of the size of a plain PLY without SH.
+//! Compressed PLY of SuperSplat: chunks of 256 Gaussians with their bounds, each Gaussian in four
+//! 32-bit words, SH in bytes. About a quarter of the size of a plain PLY without SH.
 use super::ply_header::PropertyType;
 use super::ply_table as table;
 use super::{degree, ply_comments, usable};
@@ -8,9 +8,9 @@ use crate::scene::Splats;
 use crate::{Error, Result};
 use std::path::Path;
 
-/// Gaussians in a chunk.
+/// Gaussians per chunk.
 const CHUNK: usize = 256;
-/// Columns of a chunk: least and most of position, log scale and colour.
+/// Columns of a chunk: minimum and maximum of position, log scale and colour.
 const BOUNDS: [&str; 18] = [
     "min_x",
     "min_y",
@@ -32,15 +32,15 @@ const BOUNDS: [&str; 18] = [
     "max_b",
 ];
 const WORDS: [&str; 4] = ["packed_position", "packed_rotation", "packed_scale", "packed_color"];
-/// Log scales beyond these carry no information (1e-9 to 5e8 units) and would cost the others of
+/// Log scales beyond ± this carry no information (2e-9 to 5e8 units) and would cost the others of
 /// the chunk their precision.
 const LOG_SCALE_MAX: f32 = 20.0;
-/// Bytes of SH hold −4 to 4.
+/// Range of an SH byte: −4 to 4.
 const SH_RANGE: f32 = 8.0;
 /// Opacity 0 and 1 have no finite logit; the bytes next to them are at ±5.5.
 const LOGIT_MAX: f32 = 10.0;
 
-/// Whether the columns of the vertices are packed ones.
+/// Whether the vertex columns are packed.
 pub(super) fn is_packed(columns: &[(String, PropertyType)]) -> bool {
     columns.iter().any(|c| c.0 == WORDS[0])
 }
@@ -50,7 +50,7 @@ pub(super) fn parse(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, Str
     let chunks = table::rows(bytes, "chunk")?;
     let vertices = table::rows(bytes, "vertex")?;
     let words = vertices.all(WORDS)?;
-    // Before version 2 of SuperSplat, chunks had no bounds of the colour: it spans 0 to 1.
+    // Before version 2 of SuperSplat, chunks had no colour bounds: colours span 0 to 1.
     let bounds: Vec<Option<usize>> = BOUNDS.iter().map(|n| chunks.find(n)).collect();
     if let Some(k) = (0..12).find(|k| bounds[*k].is_none()) {
         return Err(format!("no column {} in the chunks", BOUNDS[k]));
@@ -84,7 +84,7 @@ pub(super) fn parse(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, Str
         if let Some(rows) = &sh {
             for k in 0..s.sh_len() - 1 {
                 s.sh.extend([0, 1, 2].map(|channel| {
-                    // The middle of the byte's interval; 0 and 255 are the ends themselves.
+                    // Middle of the byte's interval; 0 and 255 are the ends themselves.
                     let v = rows.value(i, columns[channel * rest + k]);
                     let at = if v <= 0.0 {
                         0.0
@@ -104,14 +104,14 @@ pub(super) fn parse(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, Str
     Ok(s)
 }
 
-/// 11, 10 and 11 bits from the top, each as a share of its largest value.
+/// 11, 10 and 11 bits from the top, each divided by its maximum.
 fn thirds(word: u32) -> [f32; 3] {
     [(word >> 21) as f32 / 2047.0, (word >> 11 & 1023) as f32 / 1023.0, (word & 2047) as f32 / 2047.0]
 }
 
 fn pack_thirds(v: [f32; 3]) -> u32 {
-    let part = |v: f32, most: f32| (v * most).round().clamp(0.0, most) as u32;
-    part(v[0], 2047.0) << 21 | part(v[1], 1023.0) << 11 | part(v[2], 2047.0)
+    let quantised = |v: f32, most: f32| (v * most).round().clamp(0.0, most) as u32;
+    quantised(v[0], 2047.0) << 21 | quantised(v[1], 1023.0) << 11 | quantised(v[2], 2047.0)
 }
 
 /// Index of the largest of (w, x, y, z), then the others in order, ten bits each over ±1/√2.
@@ -138,8 +138,8 @@ fn pack_rotation(q: [f32; 4]) -> u32 {
     })
 }
 
-/// Writes a file. Neighbours share a chunk, so the Gaussians change their order: row r of the file
-/// is number `order[r]` of the scene.
+/// Writes a file. Neighbours share a chunk, so the order of the Gaussians changes: row r of the
+/// file is Gaussian `order[r]` of the scene.
 pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
     usable::check_written(s)?;
     let order = morton_order(&s.means);
@@ -159,7 +159,7 @@ pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
     let mut out = (header + "end_header\n").into_bytes();
     let mut vertices = Vec::with_capacity(16 * s.len());
     for chunk in order.chunks(CHUNK) {
-        let values: Vec<[f32; 9]> = chunk.iter().map(|i| bounded(s, *i as usize)).collect();
+        let values: Vec<[f32; 9]> = chunk.iter().map(|i| bounded_values(s, *i as usize)).collect();
         let least: [f32; 9] = std::array::from_fn(|k| values.iter().fold(f32::INFINITY, |m, v| m.min(v[k])));
         let most: [f32; 9] =
             std::array::from_fn(|k| values.iter().fold(f32::NEG_INFINITY, |m, v| m.max(v[k])));
@@ -200,8 +200,8 @@ pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
     Ok(order)
 }
 
-/// What chunks bound: position, log scale, colour.
-fn bounded(s: &Splats, i: usize) -> [f32; 9] {
+/// Bounded values of a chunk: position, log scale, colour.
+fn bounded_values(s: &Splats, i: usize) -> [f32; 9] {
     let ([x, y, z], [a, b, c]) =
         (s.means[i], s.log_scales[i].map(|v| v.clamp(-LOG_SCALE_MAX, LOG_SCALE_MAX)));
     let base = &s.sh[i * 3 * s.sh_len()..];
@@ -209,7 +209,7 @@ fn bounded(s: &Splats, i: usize) -> [f32; 9] {
     [x, y, z, a, b, c, r, g, blue]
 }
 
-/// Indices along a space-filling curve, ten bits an axis.
+/// Indices in Morton order, ten bits per axis.
 fn morton_order(means: &[[f32; 3]]) -> Vec<u32> {
     let mut low = [f32::INFINITY; 3];
     let mut high = [f32::NEG_INFINITY; 3];
@@ -218,15 +218,18 @@ fn morton_order(means: &[[f32; 3]]) -> Vec<u32> {
             (low[k], high[k]) = (low[k].min(m[k]), high[k].max(m[k]));
         }
     }
-    let spread = |v: u32| (0..10).fold(0u32, |out, bit| out | (v >> bit & 1) << (3 * bit));
-    let key = |m: &[f32; 3]| {
-        (0..3).fold(0u32, |key, k| {
-            let span = high[k] - low[k];
-            let at = if span > 0.0 { ((m[k] - low[k]) / span * 1023.0) as u32 } else { 0 };
-            key | spread(at.min(1023)) << k
-        })
-    };
-    let mut keyed: Vec<(u32, u32)> = means.iter().enumerate().map(|(i, m)| (key(m), i as u32)).collect();
+    let mut keyed: Vec<(u32, u32)> =
+        means.iter().enumerate().map(|(i, m)| (morton_key(m, &low, &high), i as u32)).collect();
     keyed.sort_unstable();
     keyed.into_iter().map(|(_, i)| i).collect()
+}
+
+/// Morton code of a position between two bounds.
+fn morton_key(mean: &[f32; 3], low: &[f32; 3], high: &[f32; 3]) -> u32 {
+    let spread = |v: u32| (0..10).fold(0u32, |out, bit| out | (v >> bit & 1) << (3 * bit));
+    (0..3).fold(0u32, |key, k| {
+        let span = high[k] - low[k];
+        let at = if span > 0.0 { ((mean[k] - low[k]) / span * 1023.0) as u32 } else { 0 };
+        key | spread(at.min(1023)) << k
+    })
 }

@@ -6,19 +6,19 @@ use crate::scene::{PointCloud, SH_C0};
 use crate::{Error, Result, files};
 use std::path::Path;
 
-/// Names that programs give to colours, most usual first; capitals do not count.
+/// Usual names of colour columns, most common first; case-insensitive.
 const COLOURS: [[&str; 3]; 3] =
     [["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"]];
 
-/// Columns of colours, and the value that stands for white.
+/// Colour columns, and the value of white.
 pub(super) struct Colours {
     columns: [usize; 3],
     white: f32,
 }
 
 impl Colours {
-    /// The colour columns of a table. Bytes end at 255, unsigned shorts at 65535; other types, and
-    /// shorts that end at 255, are told by the greatest value, which is noted.
+    /// Colour columns of a table. Bytes end at 255, unsigned shorts at 65535; for other types, and
+    /// shorts that end at 255, the greatest value decides, which is noted.
     pub fn of(t: &Table, notes: &mut Vec<String>) -> Result<Option<Colours>, String> {
         let found = |names: &[&str; 3]| t.all_of_any_case(*names);
         let Some((names, columns)) = COLOURS.iter().find_map(|n| Some((n, found(n)?))) else {
@@ -37,8 +37,8 @@ impl Colours {
         let white = match kinds[0] {
             PropertyType::U8 => return Ok(Some(Colours { columns, white: 255.0 })),
             PropertyType::U16 if greatest > 255.0 => return Ok(Some(Colours { columns, white: 65535.0 })),
-            // Photos of high dynamic range go a little beyond white; nothing of 0 to 255 is as dark
-            // as this.
+            // Photos of high dynamic range slightly exceed white; colours of 0 to 255 are never all
+            // this dark.
             _ if !whole && greatest <= BRIGHTEST_SHARE => 1.0,
             _ if greatest <= 255.0 => 255.0,
             _ if greatest <= 65535.0 => 65535.0,
@@ -58,7 +58,7 @@ impl Colours {
         Ok(Some(Colours { columns, white }))
     }
 
-    /// The colour of a row, 0 to 1.
+    /// Colour of a row, 0 to 1.
     pub fn at(&self, t: &Table, row: usize) -> [f32; 3] {
         self.columns.map(|c| (t.at(row, c) / self.white).clamp(0.0, 1.0))
     }
@@ -69,11 +69,11 @@ impl Colours {
     }
 }
 
-/// Greatest float colour that is read as a share of white.
+/// Greatest float colour that is read as relative to white.
 const BRIGHTEST_SHARE: f32 = 4.0;
 
 /// Reads positions and colours (`red green blue`, `r g b` or `diffuse_red …` of any type, or
-/// `f_dc`), and what is not read of the file, a line each; confidence 1, radius 0.
+/// `f_dc`), with notes on parts that are not read, a line each; confidence 1, radius 0.
 pub fn read_points(path: &Path) -> Result<(PointCloud, Vec<String>)> {
     let place = path.display();
     let t = table(files::read(path)?).map_err(|e| Error::input(format!("{place}: {e}")))?;
@@ -114,8 +114,8 @@ fn points(t: &Table, notes: &mut Vec<String>) -> Result<PointCloud, String> {
     Ok(p)
 }
 
-/// Writes a coloured point cloud as other tools expect it: `x y z nx ny nz` float, `red green blue`
-/// uchar.
+/// Writes a coloured point cloud in the layout of other tools: `x y z nx ny nz` float, `red green
+/// blue` uchar.
 pub fn write_points(path: &Path, p: &PointCloud) -> Result<()> {
     let mut bytes = String::from("ply\nformat binary_little_endian 1.0\n").into_bytes();
     let mut header = format!("element vertex {}\n", p.len());
@@ -136,7 +136,7 @@ pub fn write_points(path: &Path, p: &PointCloud) -> Result<()> {
 mod tests {
     use super::*;
 
-    /// Two points, the second of them white, with colours of these types and names.
+    /// Two points, the second one white, with colours of this type and these names.
     fn read(kind: &str, names: &str, white: &str) -> Result<(PointCloud, Vec<String>)> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ply");
@@ -154,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_are_scaled_by_type_and_range() {
+    fn colours_scale_by_type_and_range() {
         for (kind, names, white, noted) in [
             ("uchar", "red green blue", "255", false),
             ("ushort", "red green blue", "65535", false),
@@ -174,14 +174,14 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_read_of_points_is_named() {
+    fn unread_point_columns_are_noted() {
         let (cloud, notes) = read("float", "alpha intensity label", "1.0").unwrap();
         assert_eq!(cloud.colours, [[0.5; 3]; 2]);
         assert!(notes[0].contains("no colours") && notes[1].contains("alpha, intensity, label"), "{notes:?}");
     }
 
     #[test]
-    fn points_far_from_the_origin_are_named() {
+    fn points_far_from_origin_are_noted() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.ply");
         let columns =

@@ -6,7 +6,7 @@ use crate::files;
 pub(super) struct Table {
     pub rows: usize,
     pub columns: Vec<(String, PropertyType)>,
-    /// As [`Header::comments`] and [`Header::elements`].
+    /// See [`Header::comments`] and [`Header::elements`].
     pub comments: Vec<String>,
     elements: Vec<String>,
     cells: Cells,
@@ -15,7 +15,8 @@ pub(super) struct Table {
 enum Cells {
     /// [rows, columns], parsed from text.
     Parsed(Vec<f32>),
-    /// The file, read value by value: columns of bytes would take four times as much as floats.
+    /// The file, decoded value by value: parsing columns of bytes to floats would take four times
+    /// the memory.
     Stored { bytes: Vec<u8>, first: usize, offsets: Vec<usize>, width: usize, little: bool },
 }
 
@@ -36,7 +37,7 @@ impl Table {
             }
         }
     }
-    /// Column numbers of all the names, or the first name that is missing.
+    /// Column numbers of all names, or the first missing name.
     pub fn all<const N: usize>(&self, names: [&str; N]) -> Result<[usize; N], String> {
         let mut out = [0; N];
         for (o, name) in out.iter_mut().zip(names) {
@@ -44,7 +45,7 @@ impl Table {
         }
         Ok(out)
     }
-    /// [`Table::all`], whatever capitals the names have; `None` without one of them.
+    /// Like [`Table::all`], case-insensitive; `None` if a name is missing.
     pub fn all_of_any_case<const N: usize>(&self, names: [&str; N]) -> Option<[usize; N]> {
         let find = |name: &str| self.columns.iter().position(|c| c.0.eq_ignore_ascii_case(name));
         let mut out = [0; N];
@@ -53,7 +54,7 @@ impl Table {
         }
         Some(out)
     }
-    /// Columns `prefix0, prefix1, …`, of which none is left out.
+    /// Columns `prefix0, prefix1, …`, without gaps.
     pub fn series(&self, prefix: &str) -> Result<Vec<usize>, String> {
         let found: Vec<usize> = (0..).map_while(|k| self.column(&format!("{prefix}{k}"))).collect();
         match self.columns.iter().filter(|c| c.0.starts_with(prefix)).count() == found.len() {
@@ -63,13 +64,13 @@ impl Table {
             }
         }
     }
-    /// A line on the columns other than `read` and on the other elements.
+    /// A note on columns other than `read` and on other elements.
     pub fn unread(&self, read: &[&str]) -> Option<String> {
         unread(&self.columns, read, &self.elements, &["vertex"])
     }
 }
 
-/// A line on columns and elements that are not read; normals have no meaning here and are not
+/// A note on columns and elements that are not read; normals have no meaning here and are not
 /// named.
 fn unread(
     columns: &[(String, PropertyType)],
@@ -89,14 +90,14 @@ fn unread(
     (!parts.is_empty()).then(|| format!("not read: {}", parts.join("; ")))
 }
 
-/// The rows of one element of a binary file, with every digit of their values.
+/// Rows of one element of a binary file, with full precision.
 pub(super) struct Rows<'a> {
     columns: Vec<(String, PropertyType)>,
     offsets: Vec<usize>,
     width: usize,
     little: bool,
     bytes: &'a [u8],
-    /// As [`Header::comments`] and [`Header::elements`].
+    /// See [`Header::comments`] and [`Header::elements`].
     pub comments: Vec<String>,
     elements: Vec<String>,
 }
@@ -108,7 +109,7 @@ impl Rows<'_> {
     pub fn find(&self, name: &str) -> Option<usize> {
         self.columns.iter().position(|c| c.0 == name)
     }
-    /// Column numbers of all the names.
+    /// Column numbers of all names.
     pub fn all<const N: usize>(&self, names: [&str; N]) -> Result<[usize; N], String> {
         let mut out = [0; N];
         for (o, name) in out.iter_mut().zip(names) {
@@ -116,11 +117,11 @@ impl Rows<'_> {
         }
         Ok(out)
     }
-    /// Columns `prefix0, prefix1, …` as long as they go on.
+    /// Columns `prefix0, prefix1, …` up to the first gap.
     pub fn series(&self, prefix: &str) -> Vec<usize> {
         (0..).map_while(|k| self.find(&format!("{prefix}{k}"))).collect()
     }
-    /// As [`Table::unread`], with the elements that are read.
+    /// Like [`Table::unread`], with the elements that are read.
     pub fn unread(&self, read: &[&str], elements: &[&str]) -> Option<String> {
         unread(&self.columns, read, &self.elements, elements)
     }
@@ -131,7 +132,7 @@ impl Rows<'_> {
     }
 }
 
-/// Whether the file has such an element.
+/// Whether the file has an element of a name.
 pub(super) fn has(bytes: &[u8], element: &str) -> bool {
     header(bytes, element).is_ok()
 }
@@ -143,7 +144,7 @@ pub(super) fn rows<'a>(bytes: &'a [u8], element: &str) -> Result<Rows<'a>, Strin
         return Err("an ASCII file cannot hold packed columns".into());
     }
     let (offsets, width) = layout(&h.columns);
-    let (first, end) = place(&h, width, bytes.len())?;
+    let (first, end) = byte_range(&h, width, bytes.len())?;
     Ok(Rows {
         columns: h.columns,
         offsets,
@@ -155,7 +156,7 @@ pub(super) fn rows<'a>(bytes: &'a [u8], element: &str) -> Result<Rows<'a>, Strin
     })
 }
 
-/// Where the columns of a row begin, and its bytes.
+/// Byte offsets of the columns in a row, and the size of a row.
 fn layout(columns: &[(String, PropertyType)]) -> (Vec<usize>, usize) {
     let mut width = 0;
     let mut next = |(_, kind): &(String, PropertyType)| {
@@ -166,9 +167,8 @@ fn layout(columns: &[(String, PropertyType)]) -> (Vec<usize>, usize) {
     (offsets, width)
 }
 
-/// First byte of the rows and the first after them. Checked before anything is allocated: the
-/// counts come from the file.
-fn place(h: &Header, width: usize, size: usize) -> Result<(usize, usize), String> {
+/// Byte range of the rows. Checked before anything is allocated: the counts come from the file.
+fn byte_range(h: &Header, width: usize, size: usize) -> Result<(usize, usize), String> {
     let first = h.body.checked_add(h.skip);
     let end = first.and_then(|first| h.rows.checked_mul(width)?.checked_add(first));
     match (first, end) {
@@ -186,18 +186,18 @@ pub(super) fn table(bytes: Vec<u8>) -> Result<Table, String> {
         Cells::Parsed(parsed(&h, bytes.get(h.body..).unwrap_or_default())?)
     } else {
         let (offsets, width) = layout(&h.columns);
-        let (first, _) = place(&h, width, bytes.len())?;
+        let (first, _) = byte_range(&h, width, bytes.len())?;
         Cells::Stored { bytes, first, offsets, width, little: h.little }
     };
     Ok(Table { rows: h.rows, columns: h.columns, comments: h.comments, elements: h.elements, cells })
 }
 
-/// The rows of a text file.
+/// Values of a text file, row by row.
 fn parsed(h: &Header, body: &[u8]) -> Result<Vec<f32>, String> {
     let wide = h.columns.len();
     let text = std::str::from_utf8(body).map_err(|_| "the ASCII body is not text".to_string())?;
     let early = || format!("{} rows are announced but the file ends early; copy it again", h.rows);
-    // A value takes two bytes at least, with the blank after it.
+    // A value takes at least two bytes with the blank after it.
     let count = h.rows.checked_mul(wide).filter(|n| *n <= body.len().div_ceil(2)).ok_or_else(early)?;
     let mut values = Vec::with_capacity(count);
     // Either character ends a line, so that both together leave an empty one.

@@ -1,17 +1,17 @@
-//! `.splat`: 32 bytes a Gaussian, for web viewers. Only the base colour survives.
+//! `.splat`: 32 bytes per Gaussian, for web viewers. Only the base colour survives.
 use super::usable;
 use crate::math::quaternion_norm;
 use crate::scene::Splats;
 use crate::{Error, Result, files};
 use std::path::Path;
 
-/// Largest base colour that a byte holds.
+/// Largest base colour of a byte.
 pub const BRIGHTEST: f32 = 1.0;
 
-/// Bytes of a Gaussian.
+/// Bytes per Gaussian.
 const ROW: usize = 32;
 
-/// Reads a file: SH of degree 0, rotations as precise as a byte. It has nothing beside Gaussians.
+/// Reads a file: SH of degree 0, rotations at byte precision. All of the file is read.
 pub fn read_noted(path: &Path, _notes: &mut Vec<String>) -> Result<Splats> {
     let bytes = files::read(path)?;
     if !bytes.len().is_multiple_of(ROW) {
@@ -37,7 +37,7 @@ pub fn read_noted(path: &Path, _notes: &mut Vec<String>) -> Result<Splats> {
 
 /// Writes positions and standard deviations (f32 × 3 each), base colour and opacity (u8 × 4),
 /// rotation (w, x, y, z as `128 q + 128`), the most visible splats first, as progressive viewers
-/// expect: row r of the file is number `order[r]` of the scene.
+/// expect: row r of the file is Gaussian `order[r]` of the scene.
 pub fn write_splats(path: &Path, s: &Splats) -> Result<Vec<u32>> {
     usable::check_written(s)?;
     let alpha = |i: usize| crate::math::sigmoid(s.opacity_logits[i]);

@@ -3,7 +3,7 @@
 //!
 //! The format's axes are right, up, back unless a file states others; files are turned by 180°
 //! about x on the way in and out. Positions are 24-bit fixed point with as many fractional bits as
-//! their extent leaves room for (the format's own tools take 12).
+//! their extent permits (the format's own tools take 12).
 use super::{degree, spz_extensions, usable};
 use crate::math::quaternion_norm;
 use crate::scene::{Splats, sh_coefficients};
@@ -12,41 +12,41 @@ use std::io::{Read, Write as _};
 use std::path::Path;
 
 const MAGIC: u32 = 0x5053_474e; // "NGSP"
-/// Bytes of the header of versions 1 to 3, which is also the beginning of version 4's.
+/// Bytes of the header of versions 1 to 3; version 4 begins with it, too.
 const HEADER: usize = 16;
-/// Bytes of version 4's header.
+/// Bytes of the header of version 4.
 const HEADER_4: usize = 32;
-/// Widest position that 24 signed bits hold.
+/// Largest position in 24 signed bits.
 const FIXED_MAX: f32 = 8_388_607.0;
 /// Slope of the base colour: byte = (f_dc · 0.15 + 0.5) · 255.
 const COLOUR_SCALE: f32 = 0.15;
-/// Largest base colour that a byte holds: f_dc ends at 0.5 / 0.15.
+/// Largest base colour of a byte: f_dc ends at 0.5 / 0.15.
 pub const BRIGHTEST: f32 = 0.5 + crate::scene::SH_C0 * 0.5 / COLOUR_SCALE;
-/// Most Gaussians that are read, so that a damaged count does not take all memory: ten times the
-/// largest scenes shared.
+/// Largest number of Gaussians that is read, so that a damaged count does not exhaust memory: ten
+/// times the largest shared scenes.
 const MAX_GAUSSIANS: usize = 100_000_000;
 
-/// Most bytes of extension records: those that are known have some dozens.
+/// Largest size of the extension records: known ones have some dozens of bytes.
 const MOST_BEHIND: u64 = 1 << 20;
 
-/// Signs of the SH coefficients when y and z turn round: the parity of each basis function in (y,
+/// Signs of the SH coefficients when y and z are negated: the parity of each basis function in (y,
 /// z) together.
 const SH_SIGNS: [f32; 16] =
     [1.0, -1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
 
-/// Versions that are written.
+/// Supported versions for writing.
 pub const VERSIONS: std::ops::RangeInclusive<u32> = 2..=4;
-/// The newest version that most programs read: of the loaders of Niantic, SuperSplat and Spark
-/// (2.2) all know 3, Spark's not 4.
+/// The newest version that most programs read: the loaders of Niantic, SuperSplat and Spark (2.2)
+/// all read 3; Spark's does not read 4.
 pub const DEFAULT_VERSION: u32 = 3;
 
 /// Bits of the header's flags.
 const ANTIALIASED: u8 = 0x01;
 const EXTENSIONS: u8 = 0x02;
-/// Spark's: a tree of levels of detail, its opacities halved.
+/// Flag of Spark: a tree of levels of detail, with halved opacities.
 const LEVELS_OF_DETAIL: u8 = 0x80;
 
-/// How a file stores what: the fields of its header.
+/// Header of a file.
 struct Head {
     version: u32,
     count: usize,
@@ -111,7 +111,7 @@ impl Head {
 }
 
 impl Head {
-    /// [`Head::sections`] where a file of `size` bytes may hold as much: the count comes from the
+    /// Like [`Head::sections`], bounded by the size of the file in bytes: the count comes from the
     /// file.
     fn checked_sections(&self, size: usize) -> Result<[usize; 6], String> {
         let sections = self.sections();
@@ -122,7 +122,7 @@ impl Head {
     }
 }
 
-/// Reads a file; notes name what is not read, a line each.
+/// Reads a file; notes name parts that are not read, a line each.
 pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
     let bytes = files::read(path)?;
     let parsed = files::guarded(|| parse(&bytes, notes)).unwrap_or_else(|panic| Err(broken(panic)));
@@ -136,15 +136,15 @@ fn parse(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
     if Head::parse(bytes)?.version >= 4 { unpack_4(bytes, notes) } else { unpack(bytes, notes) }
 }
 
-/// The content of a gzip stream: the Gaussians, and what stands behind them within its limit.
+/// Content of a gzip stream: the Gaussians, and a bounded number of bytes after them.
 fn inflated(bytes: &[u8]) -> Result<Vec<u8>, String> {
     let mut plain = Vec::new();
     let mut gzip = flate2::read::GzDecoder::new(bytes);
-    // The header first: it tells how much may follow.
+    // The header first: it states how much may follow.
     gzip.by_ref().take(HEADER as u64).read_to_end(&mut plain).map_err(broken)?;
     let size = Head::parse(&plain)?.checked_sections(bytes.len())?.iter().sum::<usize>();
     gzip.by_ref().take(size as u64).read_to_end(&mut plain).map_err(broken)?;
-    // The end of the stream checks the sum of what came before it.
+    // The decoder verifies the checksum at the end of the stream.
     gzip.by_ref().take(MOST_BEHIND).read_to_end(&mut plain).map_err(broken)?;
     match gzip.read(&mut [0]).map_err(broken)? {
         0 => Ok(plain),
@@ -168,11 +168,16 @@ fn unpack(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
         *part = rest.get(..size).ok_or("the file ends early; copy it again")?;
         rest = &rest[size..];
     }
-    placed(&head, splats(&head, parts, notes), rest, notes)
+    in_scene_axes(&head, splats(&head, parts, notes), rest, notes)
 }
 
-/// Gaussians in the axes of the scene, by the extensions of their file.
-fn placed(head: &Head, mut s: Splats, extensions: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
+/// Gaussians in the axes of the scene, by the extension records of their file.
+fn in_scene_axes(
+    head: &Head,
+    mut s: Splats,
+    extensions: &[u8],
+    notes: &mut Vec<String>,
+) -> Result<Splats, String> {
     match (head.flags & EXTENSIONS != 0, extensions.len()) {
         (true, _) => spz_extensions::apply(&mut s, extensions, notes)?,
         (false, 0) => {}
@@ -183,13 +188,8 @@ fn placed(head: &Head, mut s: Splats, extensions: &[u8], notes: &mut Vec<String>
 
 fn unpack_4(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
     let head = Head::parse(bytes)?;
-    let early = || "the file ends early; copy it again".to_string();
-    let word = |at: usize| -> Result<u64, String> {
-        let b = bytes.get(at..at + 8).ok_or_else(early)?;
-        Ok(u64::from_le_bytes([b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]]))
-    };
-    let streams = usize::from(*bytes.get(15).ok_or_else(early)?);
-    let table = (word(16)? & 0xffff_ffff) as usize;
+    let streams = usize::from(*bytes.get(15).ok_or_else(truncated)?);
+    let table = (long_word(bytes, 16)? & 0xffff_ffff) as usize;
     let extensions =
         bytes.get(HEADER_4..table).ok_or("its table begins inside of its header; copy it again")?;
     // Empty attributes have no stream.
@@ -202,14 +202,14 @@ fn unpack_4(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
     let mut at = table + 16 * streams;
     let mut stream = 0;
     for (part, size) in parts.iter_mut().zip(sizes).filter(|(_, size)| *size > 0) {
-        let length = usize::try_from(word(table + 16 * stream)?).map_err(|_| early())?;
-        let end = at.checked_add(length).ok_or_else(early)?;
-        let packed = bytes.get(at..end).ok_or_else(early)?;
+        let length = usize::try_from(long_word(bytes, table + 16 * stream)?).map_err(|_| truncated())?;
+        let end = at.checked_add(length).ok_or_else(truncated)?;
+        let packed = bytes.get(at..end).ok_or_else(truncated)?;
         part.reserve_exact(size);
         let mut decoder = ruzstd::decoding::StreamingDecoder::new(packed).map_err(broken)?;
         decoder.by_ref().take(size as u64).read_to_end(part).map_err(broken)?;
         if part.len() != size {
-            return Err(early());
+            return Err(truncated());
         }
         if decoder.read(&mut [0]).map_err(broken)? != 0 {
             return Err("a stream holds more than its Gaussians; copy the file again".into());
@@ -217,7 +217,17 @@ fn unpack_4(bytes: &[u8], notes: &mut Vec<String>) -> Result<Splats, String> {
         (at, stream) = (end, stream + 1);
     }
     let s = splats(&head, [0, 1, 2, 3, 4, 5].map(|k| parts[k].as_slice()), notes);
-    placed(&head, s, extensions, notes)
+    in_scene_axes(&head, s, extensions, notes)
+}
+
+fn truncated() -> String {
+    "the file ends early; copy it again".to_string()
+}
+
+/// The little-endian 64-bit word at an offset.
+fn long_word(bytes: &[u8], at: usize) -> Result<u64, String> {
+    let b = bytes.get(at..at + 8).ok_or_else(truncated)?;
+    Ok(u64::from_le_bytes([b[0], b[1], b[2], b[3], b[4], b[5], b[6], b[7]]))
 }
 
 fn splats(head: &Head, parts: [&[u8]; 6], notes: &mut Vec<String>) -> Splats {
@@ -254,12 +264,12 @@ fn splats(head: &Head, parts: [&[u8]; 6], notes: &mut Vec<String>) -> Splats {
     }
 }
 
-/// The rotation (w, x, y, z) seen in axes with y and z turned round.
+/// Rotation (w, x, y, z) in axes with y and z negated.
 fn turned([w, x, y, z]: [f32; 4]) -> [f32; 4] {
     [w, x, -y, -z]
 }
 
-/// Version 2: x, y, z in bytes; w is what is missing to length one, and positive.
+/// Version 2: x, y, z in bytes; w follows from unit length, and is positive.
 fn first_three(b: &[u8]) -> [f32; 4] {
     let [x, y, z] = [0, 1, 2].map(|k| f32::from(b[k]) / 127.5 - 1.0);
     [(1.0 - x * x - y * y - z * z).max(0.0).sqrt(), x, y, z]
@@ -272,9 +282,9 @@ fn pack_three(q: [f32; 4]) -> [u8; 3] {
     [1, 2, 3].map(|k| byte((q[k] * sign + 1.0) * 127.5))
 }
 
-/// Largest magnitude of a component that is not the largest one.
+/// Largest magnitude of any component except the largest.
 const SMALLER_MAX: f32 = std::f32::consts::FRAC_1_SQRT_2;
-/// Nine bits of magnitude.
+/// Largest value in nine bits.
 const MAGNITUDE: u32 = 511;
 
 /// Version 3: index of the largest of (x, y, z, w) in the top two bits, then the other three from
@@ -298,7 +308,7 @@ fn pack_rotation([w, x, y, z]: [f32; 4]) -> [u8; 4] {
     let q = [x, y, z, w];
     let norm = quaternion_norm(&q);
     let largest = (0..4).max_by(|a, b| q[*a].abs().total_cmp(&q[*b].abs())).unwrap_or(3);
-    // q and −q are one rotation: the largest component is stored positive, and so not at all.
+    // q and −q are one rotation: with a positive sign the largest component need not be stored.
     let sign = q[largest].signum() / norm;
     let mut bits = largest as u32;
     for k in (0..4).filter(|k| *k != largest) {
@@ -330,14 +340,14 @@ pub fn write_splats(path: &Path, s: &Splats, version: u32) -> Result<()> {
         out.extend(word.to_le_bytes());
     }
     let flags = if s.antialiased { ANTIALIASED } else { 0 };
-    // Only version 4 has streams to count.
+    // Only version 4 has a number of streams.
     let streams = if version >= 4 { sections.len() as u8 } else { 0 };
     out.extend([s.sh_degree as u8, bits as u8, flags, streams]);
     let out = if version >= 4 { streams_of(out, &sections) } else { gzip_of(out, &sections) };
     std::fs::write(path, out.map_err(Error::unwritable(path))?).map_err(Error::unwritable(path))
 }
 
-/// Versions 2 and 3: everything in one stream.
+/// Versions 2 and 3: all sections in one gzip stream.
 fn gzip_of(mut plain: Vec<u8>, sections: &[Vec<u8>]) -> std::io::Result<Vec<u8>> {
     sections.iter().for_each(|p| plain.extend_from_slice(p));
     let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::default());
@@ -345,7 +355,7 @@ fn gzip_of(mut plain: Vec<u8>, sections: &[Vec<u8>]) -> std::io::Result<Vec<u8>>
     gzip.finish()
 }
 
-/// Version 4: a table of streams, then one per attribute.
+/// Version 4: a table of streams, then one stream per attribute.
 fn streams_of(mut out: Vec<u8>, sections: &[Vec<u8>]) -> std::io::Result<Vec<u8>> {
     out.extend((HEADER_4 as u32).to_le_bytes());
     out.resize(HEADER_4, 0);
@@ -360,12 +370,12 @@ fn streams_of(mut out: Vec<u8>, sections: &[Vec<u8>]) -> std::io::Result<Vec<u8>
     Ok(out)
 }
 
-/// Largest coordinate.
+/// Largest absolute coordinate.
 fn widest(s: &Splats) -> f32 {
     s.means.as_flattened().iter().fold(0.0f32, |m, v| m.max(v.abs()))
 }
 
-/// The most fractional bits, up to 24, with which all positions fit.
+/// Largest number of fractional bits, up to 24, with which all positions fit.
 fn fraction_bits(s: &Splats) -> Option<u32> {
     let widest = widest(s);
     (0..=24).rev().find(|b| widest * (1u32 << b) as f32 <= FIXED_MAX)
@@ -405,8 +415,7 @@ mod tests {
     use super::*;
     use crate::scene::seeded;
 
-    /// A bare file of version 3 with a header that `change` changes, and what follows its
-    /// Gaussians.
+    /// A bare file of version 3, altered by `change`, with `behind` after its Gaussians.
     fn read(change: impl FnOnce(&mut Vec<u8>), behind: &[u8]) -> Result<(Splats, Vec<String>), String> {
         let s = seeded::small(5, 32, 24, 3, 1002).0;
         let mut bytes = Vec::new();
@@ -437,7 +446,7 @@ mod tests {
     }
 
     #[test]
-    fn fourth_sh_band_is_left_out_with_note() {
+    fn fourth_sh_band_is_noted() {
         let (plain, _) = read(|_| {}, &[]).unwrap();
         // Each Gaussian's 15 coefficients, then the nine of band 4.
         let (s, notes) = read(
@@ -455,7 +464,7 @@ mod tests {
     }
 
     #[test]
-    fn what_stands_behind_gaussians_is_bounded() {
+    fn bytes_behind_gaussians_are_bounded() {
         let (_, notes) = read(|_| {}, &[7; 9]).unwrap();
         assert!(notes[0].contains("9 bytes"), "{notes:?}");
         let mut bytes = Vec::new();
@@ -480,8 +489,8 @@ mod tests {
             for (a, b) in s.quats.iter().zip(&back.quats) {
                 let norm = a.iter().map(|v| v * v).sum::<f32>().sqrt();
                 let dot = a.iter().zip(b).map(|(x, y)| x * y).sum::<f32>() / norm;
-                // In version 2 w is what the others leave, so half a step of theirs moves a w near
-                // 0 by a tenth.
+                // In version 2 w is computed from the others, so half a step of theirs moves a w
+                // near 0 by a tenth.
                 assert!(dot.abs() > if version == 2 { 0.99 } else { 0.99999 }, "{version}: {dot}");
             }
         }

@@ -1,19 +1,19 @@
-//! Extension records of `.spz`: a number, a length and so many bytes, one record after the other.
+//! Extension records of `.spz`: a sequence of type, length and content.
 use crate::format::transform;
 use crate::scene::{Similarity, Splats};
 use glam::{DMat3, DVec3};
 
-/// The axes of a file: a letter per axis.
+/// Record of the axes of a file: one number.
 const COORDINATE_SYSTEM: u32 = 0xadbe_0003;
-/// Names of records that say nothing about the Gaussians.
+/// Known records that do not concern the Gaussians.
 const OTHERS: [(u32, &str); 2] =
     [(0xadbe_0002, "SPZ_ADOBE_safe_orbit_camera"), (0x4e53_0001, "SPZ_NIANTIC_georeference")];
-/// A draft that stored SH in another range.
+/// Record of a draft that stored SH in another range.
 const SH_QUANTISATION: u32 = 0xadbe_0001;
 
 /// Directions of the first, second and third axis by number: right or left, up or down, front or
-/// back. 0 is "not specified". From 9 on as Niantic's present loader numbers them; its first one
-/// with these axes had 9 to 12 and 13 to 16 the other way round.
+/// back. 0 is "not specified". Numbers from 9 on follow Niantic's present loader; the first one
+/// with these axes had 9 to 12 and 13 to 16 exchanged.
 const SYSTEMS: [&str; 17] = [
     "RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD",
     "LBU", "RBU",
@@ -22,18 +22,13 @@ const SYSTEMS: [&str; 17] = [
 /// Applies the records to Gaussians that were read as right, up, back; notes name those that are
 /// not read.
 pub(super) fn apply(s: &mut Splats, mut records: &[u8], notes: &mut Vec<String>) -> Result<(), String> {
-    let early = "its extension records end early; copy the file again";
     let mut axes = None;
     while !records.is_empty() {
-        let word = |at: usize| {
-            let b = records.get(at..at + 4).ok_or(early)?;
-            Ok::<_, &str>(u32::from_le_bytes([b[0], b[1], b[2], b[3]]))
-        };
-        let (kind, length) = (word(0)?, word(4)? as usize);
-        let content = records[8..].get(..length).ok_or(early)?;
+        let (kind, length) = (word(records, 0)?, word(records, 4)? as usize);
+        let content = records[8..].get(..length).ok_or(TRUNCATED)?;
         match kind {
             COORDINATE_SYSTEM => {
-                let number = if length == 4 { word(8)? as usize } else { usize::MAX };
+                let number = if length == 4 { word(records, 8)? as usize } else { usize::MAX };
                 let system = SYSTEMS
                     .get(number)
                     .ok_or("SPZ_ADOBE_coordinate_system states axes that are not known")?;
@@ -68,9 +63,17 @@ pub(super) fn apply(s: &mut Splats, mut records: &[u8], notes: &mut Vec<String>)
     Ok(())
 }
 
-/// From a reading as right, up, back to the axes that a file really has.
+const TRUNCATED: &str = "its extension records end early; copy the file again";
+
+/// The little-endian word at an offset.
+fn word(records: &[u8], at: usize) -> Result<u32, &'static str> {
+    let b = records.get(at..at + 4).ok_or(TRUNCATED)?;
+    Ok(u32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+}
+
+/// Transforms Gaussians that were read as right, up, back from the actual axes of their file.
 fn turn(s: &mut Splats, system: &str) {
-    // Columns: the file's axes in those of a scene (right, down, forward).
+    // Columns: the axes of the file in those of a scene (right, down, forward).
     let axes: Vec<DVec3> = system.chars().map(direction).collect();
     let [x, y, z] = [0, 1, 2].map(|k| axes.get(k).copied().unwrap_or_default());
     let read_as = DMat3::from_diagonal(DVec3::new(1.0, -1.0, -1.0));
@@ -79,7 +82,7 @@ fn turn(s: &mut Splats, system: &str) {
         return;
     }
     if rotation.determinant() < 0.0 {
-        // Other-handed axes: a mirror about z, then a proper turn.
+        // Axes of opposite handedness: a mirror about z, then a proper rotation.
         transform::mirror_z(s);
         rotation.z_axis = -rotation.z_axis;
     }
@@ -107,7 +110,7 @@ mod tests {
     }
 
     fn applied(records: &[u8]) -> Result<(Splats, Vec<String>), String> {
-        // Read as right, up, back: the file itself has (1, 2, 3).
+        // As read in right, up, back; the file itself contains (1, 2, 3).
         let mut s = Splats { means: vec![[1.0, -2.0, -3.0]; 4], ..seeded::small(4, 32, 24, 3, 1004).0 };
         let mut notes = Vec::new();
         apply(&mut s, records, &mut notes).map(|()| (s, notes))

@@ -1,26 +1,25 @@
-//! Which Gaussians are read and written: those that can be computed with; and how notes on a file
-//! are shown.
+//! Validity of Gaussians in files, for reading and writing; and the form of notes on files.
 use crate::scene::{LanguageField, Splats};
 use crate::{Error, Result};
 use std::path::Path;
 
-/// Greatest magnitude of a number of a Gaussian: squares beyond 1.8e19 are not finite in f32.
+/// Greatest magnitude of a number of a Gaussian: the square of more than 1.8e19 overflows f32.
 const GREATEST: f32 = 1e18;
 
-/// A Gaussian whose numbers, standard deviations and squared quaternion are finite and at most
-/// [`GREATEST`], and whose quaternion has a direction.
+/// Whether the numbers, standard deviations and squared quaternion of a Gaussian are finite and at
+/// most [`GREATEST`], and its quaternion has a direction.
 fn is_usable(s: &Splats, i: usize) -> bool {
     let width = 3 * s.sh_len();
     let plain = [&s.means[i][..], &s.log_scales[i], &s.quats[i], &s.sh[i * width..(i + 1) * width]];
     let squared = s.quats[i].iter().map(|v| v * v).sum::<f32>();
-    // NaN is in no range.
+    // NaN fails every comparison.
     plain.into_iter().flatten().chain([&s.opacity_logits[i]]).all(|v| v.abs() <= GREATEST)
         && s.log_scales[i].iter().all(|v| *v <= GREATEST.ln())
         && squared > 0.0
         && squared.is_finite()
 }
 
-/// Number of Gaussians that are not usable, and the index of the first.
+/// Number of unusable Gaussians, and the index of the first.
 fn unusable(s: &Splats) -> Option<(usize, usize)> {
     let mut bad = (0..s.len()).filter(|i| !is_usable(s, *i));
     bad.next().map(|first| (1 + bad.count(), first))
@@ -28,9 +27,9 @@ fn unusable(s: &Splats) -> Option<(usize, usize)> {
 
 const WHY: &str = "numbers that are not finite, are beyond 1e18 or give no rotation";
 
-/// Takes Gaussians of another program's file: drops those that are not usable, with their language,
-/// and says how many. Scales of 0 and opacities of 0 and 1, whose parameters are infinite, are kept
-/// as the nearest that f32 holds.
+/// Filters Gaussians of another program's file: drops unusable ones, with their language, and notes
+/// their number. Scales of 0 and opacities of 0 and 1, whose parameters are infinite, become the
+/// nearest values in f32.
 pub(super) fn keep(
     mut s: Splats,
     language: Option<LanguageField>,
@@ -60,10 +59,10 @@ pub(super) fn keep(
     Ok((s.picked(&rows), language.map(|l| l.picked(&rows, all))))
 }
 
-/// Most notes on one file.
+/// Largest number of notes on one file.
 const MOST_NOTES: usize = 20;
 
-/// Notes on a file as they are shown: with its name, and not without end.
+/// Final form of the notes on a file: with its name, and limited in number.
 pub(super) fn finished(mut notes: Vec<String>, path: &Path) -> Vec<String> {
     let more = notes.len().saturating_sub(MOST_NOTES);
     notes.truncate(MOST_NOTES);
@@ -71,12 +70,12 @@ pub(super) fn finished(mut notes: Vec<String>, path: &Path) -> Vec<String> {
     notes.into_iter().map(|note| format!("{}: {note}", path.display())).collect()
 }
 
-/// Largest step between two coordinates, as a share of the extent: a tenth of a pixel in a picture
-/// of the whole scene.
+/// Largest step between two coordinates, relative to the extent: a tenth of a pixel in an image of
+/// the whole scene.
 const FINEST_STEP: f32 = 1e-4;
 
-/// A note where coordinates are so large against their extent that single precision is too coarse
-/// for them, as those of maps are.
+/// A note where coordinates are so large relative to their extent that single precision is too
+/// coarse, as in map coordinates.
 pub(super) fn precision(positions: &[[f32; 3]]) -> Option<String> {
     let finite = || positions.iter().filter(|p| p.iter().all(|v| v.abs() <= GREATEST));
     let mut bounds = [[f32::INFINITY, f32::NEG_INFINITY]; 3];
@@ -95,13 +94,13 @@ pub(super) fn precision(positions: &[[f32; 3]]) -> Option<String> {
     })
 }
 
-/// Refuses to read a scene of this program's with Gaussians that are not usable.
+/// Refuses a scene of this program with unusable Gaussians.
 pub fn check_read(path: &Path, s: &Splats) -> Result<()> {
     refuse(s)
         .map_err(|what| Error::input(format!("{}: {what}; the scene is damaged, run again", path.display())))
 }
 
-/// Refuses to write what would not be read.
+/// Refuses to write Gaussians that the reader would drop.
 pub(super) fn check_written(s: &Splats) -> Result<()> {
     refuse(s).map_err(|what| Error::work(format!("nothing is written: {what}")))
 }
@@ -134,7 +133,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_computed_with_is_dropped_and_counted() {
+    fn unusable_gaussians_are_dropped_and_counted() {
         type Change = fn(&mut Splats);
         let changes: [Change; 6] = [
             |s| s.means[2][0] = f32::INFINITY,
@@ -173,14 +172,14 @@ mod tests {
     }
 
     #[test]
-    fn no_format_writes_what_it_would_not_read() {
+    fn writers_refuse_unusable_gaussians() {
         let folder = tempfile::tempdir().unwrap();
         for format in &FORMATS {
             let path = folder.path().join(format!("a{}", format.ending));
             let mut s = four();
             (s.means[0], s.log_scales[1], s.sh[0]) = ([1e17, -1e17, 3.0], [41.0, -90.0, 0.0], 1e17);
             if format.name == "spz" {
-                // Its 24 bits end long before.
+                // Its 24 bits end far below that.
                 s.means[0] = [8e6, -8e6, 3.0];
             }
             super::super::write(&path, &s, None).unwrap();

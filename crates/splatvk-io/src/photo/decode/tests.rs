@@ -23,11 +23,11 @@ fn picture() -> DynamicImage {
 }
 
 #[test]
-fn the_eight_orientations_give_one_image() {
+fn eight_orientations_give_one_image() {
     use exif::{Tag, Value};
     let reference = decode(png(&picture(), None), Path::new("a.png"), None).unwrap();
     for tag in 1..=8u8 {
-        // The stored image is the upright one with the inverse of the tag applied: of the eight,
+        // The stored image is the upright one with the inverse of the tag applied; of the eight
         // only the two quarter turns are not their own inverse.
         let inverse = match tag {
             6 => 8,
@@ -62,7 +62,7 @@ fn depth_and_channels() {
 }
 
 #[test]
-fn the_size_is_checked_before_anything_is_decoded() {
+fn image_size_is_checked_before_decoding() {
     let small = png(&image::GrayImage::new(2, 2).into(), None);
     let with_size = |w: u32, h: u32| {
         let mut bytes = small.clone();
@@ -75,7 +75,7 @@ fn the_size_is_checked_before_anything_is_decoded() {
     };
     let e = with_size(20_000, 20_000);
     assert!(e.contains("a.png: 20000 × 20000 pixels are more than the 200 million"), "{e}");
-    // 108 megapixels are none too many: here only the pixels are missing.
+    // 108 megapixels are within the limit: here only the pixels are missing.
     let e = with_size(12_000, 9_000);
     assert!(!e.contains("million"), "{e}");
 }
@@ -93,7 +93,7 @@ fn every_cut_is_noticed() {
         assert!(whole.notes.is_empty());
         let mut read = 0;
         for cut in 0..bytes.len() {
-            // The last 12 bytes of a PNG are its empty IEND chunk: all pixels are there without it.
+            // The last 12 bytes of a PNG are its empty IEND chunk: all pixels precede it.
             if name == "a.png" && cut + 12 >= bytes.len() {
                 continue;
             }
@@ -106,7 +106,8 @@ fn every_cut_is_noticed() {
                 Err(e) => assert_eq!((e.exit_code(), e.to_string().lines().count()), (2, 1), "{e}"),
             }
         }
-        // Without the marker or its second half; one byte less may be padding of the last block.
+        // Cut before the marker or within it; a cut one byte earlier may only remove padding of the
+        // last block.
         assert!(
             if name == "a.jpg" { (2..=3).contains(&read) } else { read == 0 },
             "{name}: {read} cuts are read"
@@ -115,7 +116,7 @@ fn every_cut_is_noticed() {
 }
 
 #[test]
-fn floats_are_linear_light_and_may_exceed_one() {
+fn float_files_are_linear_light() {
     let half = image::Rgba32FImage::from_pixel(2, 2, image::Rgba([0.125, 2.0, f32::NAN, 0.5]));
     let mut exr = Cursor::new(Vec::new());
     DynamicImage::ImageRgba32F(half).write_to(&mut exr, ImageFormat::OpenExr).unwrap();
@@ -133,7 +134,7 @@ fn floats_are_linear_light_and_may_exceed_one() {
     let mut hdr = Cursor::new(Vec::new());
     let bright = image::Rgb32FImage::from_pixel(16, 2, image::Rgb([8.0, 2.0, 0.5]));
     DynamicImage::ImageRgb32F(bright).write_to(&mut hdr, ImageFormat::Hdr).unwrap();
-    // Powers of two, which the shared exponent of Radiance files holds exactly.
+    // Powers of two are exact in the shared exponent of Radiance files.
     let back =
         decode(hdr.into_inner(), Path::new("a.hdr"), None).unwrap().at(3, 1).0.map(crate::scene::to_linear);
     assert!(
@@ -166,7 +167,7 @@ fn webp_with_exif_and_alpha() {
     assert!((c[0] - 200.0 / 255.0).abs() < 1e-6 && (alpha - 0.2).abs() < 1e-6, "{c:?} {alpha}");
 }
 
-/// An uncompressed little-endian TIFF: per page a size, the tags besides those of the layout, and
+/// An uncompressed little-endian TIFF; per page: a size, the tags besides those of the layout, and
 /// the strip.
 fn tiff(pages: &[(u32, u32, &[(u16, u16, Vec<u32>)], Vec<u8>)]) -> Vec<u8> {
     let mut out = b"II*\0\0\0\0\0".to_vec();
@@ -241,7 +242,7 @@ fn kinds_of_tiff() {
         near(d.at(0, 0).0, expected);
         assert_eq!((d.at(0, 0).1, d.at(1, 0)), (0.2, ([0.0; 3], 0.0)));
     }
-    // (1 − C)(1 − K), as printing inks are approximated without a profile.
+    // (1 − C)(1 − K), the usual approximation of printing inks without a profile.
     let inks = read(&layout(5, &[8; 4]), vec![0, 255, 51, 0, 0, 0, 0, 255]);
     near(inks.at(0, 0).0, [1.0, 0.0, 0.8]);
     near(inks.at(1, 0).0, [0.0; 3]);
@@ -253,7 +254,7 @@ fn kinds_of_tiff() {
 }
 
 #[test]
-fn cut_off_webp_tiff_and_exr_are_refused() {
+fn truncated_webp_tiff_exr_are_refused() {
     let noise = image::RgbImage::from_fn(24, 18, |x, y| image::Rgb([x as u8 * 9, y as u8 * 13, 7]));
     let noise = DynamicImage::from(noise);
     for (format, name) in
@@ -265,8 +266,8 @@ fn cut_off_webp_tiff_and_exr_are_refused() {
         image.write_to(&mut out, format).unwrap();
         let bytes = out.into_inner();
         assert!(decode(bytes.clone(), Path::new(name), None).is_ok());
-        // The directory of a TIFF and the padding of a WebP may end the file: what is cut must
-        // reach into the pixels.
+        // The directory of a TIFF and the padding of a WebP may end the file: a cut must reach into
+        // the pixels.
         for cut in (0..bytes.len() / 2).step_by(7) {
             let e = decode(bytes[..cut].to_vec(), Path::new(name), None).err();
             let e = e.unwrap_or_else(|| panic!("{name} cut at {cut} of {}", bytes.len()));
@@ -290,7 +291,7 @@ fn foreign_files_are_named() {
     }
 }
 
-/// A chunk of a PNG with its sum.
+/// A chunk of a PNG with its checksum.
 fn chunk(kind: &[u8; 4], data: &[u8]) -> Vec<u8> {
     let mut sum = flate2::Crc::new();
     sum.update(kind);
@@ -298,7 +299,7 @@ fn chunk(kind: &[u8; 4], data: &[u8]) -> Vec<u8> {
     [&(data.len() as u32).to_be_bytes()[..], kind, data, &sum.sum().to_be_bytes()].concat()
 }
 
-/// A PNG with chunks behind its header.
+/// A PNG with chunks after its header.
 fn with_chunks(image: &DynamicImage, chunks: &[Vec<u8>]) -> Vec<u8> {
     let whole = png(image, None);
     [&whole[..33], &chunks.concat(), &whole[33..]].concat()
@@ -312,7 +313,7 @@ fn deflated(bytes: &[u8], times: usize) -> Vec<u8> {
 }
 
 #[test]
-fn palette_of_any_length_is_no_panic() {
+fn png_palette_length_never_panics() {
     let header = [0, 0, 0, 4, 0, 0, 0, 4, 8, 3, 0, 0, 0];
     for length in 0..=800usize {
         let palette: Vec<u8> = (0..length).map(|k| (k % 251) as u8).collect();
@@ -367,7 +368,7 @@ fn code_points_of_png_are_used() {
     assert!((0..3).all(|k| by_icc[k].abs_diff(p3[k]) <= 1), "{by_icc:?} {p3:?}");
     assert_eq!(one(&[chunk(b"cICP", &[1, 13, 0, 1]), chunk(b"iCCP", &icc)]).0, plain, "before the profile");
     assert_eq!(one(&[chunk(b"sRGB", &[0]), chunk(b"gAMA", &100_000u32.to_be_bytes())]).0, plain);
-    // 1 / 2.2 is the curve of sRGB, near enough; 1 is linear light.
+    // 1 / 2.2 approximates the curve of sRGB; 1 is linear light.
     assert_eq!(one(&[chunk(b"gAMA", &45_455u32.to_be_bytes())]).0, plain);
     let linear = one(&[chunk(b"gAMA", &100_000u32.to_be_bytes())]).0;
     let expected = plain.map(|v| (to_srgb(f32::from(v) / 255.0) * 255.0).round() as u8);

@@ -1,5 +1,4 @@
-//! What the addresses of buffers lead to: data inside of the file, or files in its own folder and
-//! below.
+//! Buffers of a glTF file: data URIs, or files in its own folder and below.
 use crate::files;
 use base64::Engine;
 use base64::alphabet::STANDARD;
@@ -14,13 +13,13 @@ pub(super) struct Buffer {
     pub uri: Option<String>,
 }
 
-/// With and without the signs at the end that fill the last block.
+/// Decoder of base64 with or without padding.
 const BASE64: GeneralPurpose = GeneralPurpose::new(
     &STANDARD,
     GeneralPurposeConfig::new().with_decode_padding_mode(DecodePaddingMode::Indifferent),
 );
 
-/// The content of every address, each once.
+/// Content of every URI, each loaded once.
 pub(super) fn contents<'a>(
     buffers: &'a [Buffer],
     folder: &Path,
@@ -34,7 +33,7 @@ pub(super) fn contents<'a>(
     Ok(all)
 }
 
-/// Addresses are percent-encoded (RFC 3986); some programs write names as they are.
+/// URIs are percent-encoded (RFC 3986); some programs write plain names.
 fn content(uri: &str, folder: &Path) -> Result<Vec<u8>, String> {
     if uri.get(..5).is_some_and(|start| start.eq_ignore_ascii_case("data:")) {
         let (kind, body) = uri[5..].split_once(',').ok_or("a buffer inside of the file has no comma")?;
@@ -84,7 +83,7 @@ mod tests {
     }
 
     #[test]
-    fn data_inside_of_the_file_is_decoded() {
+    fn data_uri_is_decoded() {
         for uri in [
             "data:application/octet-stream;base64,AQL/",
             "DATA:application/gltf-buffer;Base64,AQL%2F",

@@ -1,9 +1,9 @@
-//! Extensions beside that of the Gaussians: which change them, and which do not.
+//! Other extensions: those that change the Gaussians, and those that do not.
 use super::layout::EXTENSION;
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value;
 
-/// Extensions that change neither points nor their attributes, or that the reader follows
+/// Extensions that change neither points nor their attributes, or that the reader supports
 /// (quantised numbers).
 const HARMLESS: [&str; 12] = [
     "KHR_mesh_quantization",
@@ -19,10 +19,10 @@ const HARMLESS: [&str; 12] = [
     "EXT_mesh_features",
     "EXT_structural_metadata",
 ];
-/// Beginnings of the names of such extensions.
+/// Prefixes of the names of further such extensions.
 const HARMLESS_KINDS: [&str; 2] = ["KHR_materials_", "EXT_materials_"];
 
-/// Extensions that change what is shown, and the way out.
+/// Extensions that change the Gaussians, each with advice.
 const REFUSED: [(&str, &str); 6] = [
     ("KHR_draco_mesh_compression", "export it without compression"),
     ("EXT_meshopt_compression", "export it without compression (gltf-transform copy does)"),
@@ -40,12 +40,12 @@ fn refusal(name: &str) -> Option<&'static str> {
     REFUSED.iter().find(|(kind, _)| name.starts_with(kind)).map(|(_, advice)| *advice)
 }
 
-/// Of the extensions of a part the one that is refused, if any; nothing else of them is kept.
+/// A refused extension of a part, if any; all others are dropped while parsing.
 #[derive(Default)]
 pub(super) struct Refused(Option<Box<str>>);
 
 impl Refused {
-    /// An error where there is one.
+    /// Returns an error for the refused extension, if any.
     pub fn check(&self) -> Result<(), String> {
         self.0.as_deref().map_or(Ok(()), required)
     }
@@ -73,7 +73,7 @@ impl<'de> Deserialize<'de> for Refused {
     }
 }
 
-/// Refuses an extension without which the Gaussians would be others.
+/// Refuses a required extension that changes the Gaussians.
 pub(super) fn required(name: &str) -> Result<(), String> {
     match (is_harmless(name), refusal(name)) {
         (true, _) => Ok(()),
@@ -86,13 +86,14 @@ pub(super) fn required(name: &str) -> Result<(), String> {
     }
 }
 
-/// A note on an extension that the file uses somewhere and does not need; where Gaussians have it,
-/// it is refused.
+/// Note on an extension that the file uses but does not require; refused where it applies to
+/// Gaussians.
 pub(super) fn note(name: &str) -> Option<String> {
     (!is_harmless(name)).then(|| format!("its extension {name} is not read"))
 }
 
-/// Refuses Gaussians of other kernels and colours, and notes what is drawn in another way.
+/// Refuses unsupported kernels and colour spaces, and notes properties that are rendered
+/// differently.
 pub(super) fn check(extension: &Value, notes: &mut Vec<String>) -> Result<(), String> {
     for (key, value) in extension.as_object().into_iter().flatten() {
         let text = value.as_str().unwrap_or_default();

@@ -1,5 +1,5 @@
-//! Reading: every primitive of the default scene that has the extension, moved by the nodes above
-//! it.
+//! Reader: every primitive of the default scene that has the extension, transformed by the nodes
+//! above it.
 use super::buffers::{Buffer, contents};
 use super::extensions::{self, Refused};
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
@@ -45,7 +45,8 @@ struct Node {
     mesh: Option<usize>,
     #[serde(default)]
     children: Vec<usize>,
-    // Boxed: a node without them takes few bytes in the file.
+    // Boxed: a node without these fields takes few bytes in the file, and should not take many in
+    // memory.
     matrix: Option<Box<[f64; 16]>>,
     translation: Option<Box<[f64; 3]>>,
     rotation: Option<Box<[f64; 4]>>,
@@ -61,7 +62,7 @@ struct Mesh {
 
 #[derive(Deserialize)]
 struct Primitive {
-    /// 4, triangles, is the default.
+    /// Default 4, triangles.
     mode: Option<u32>,
     attributes: BTreeMap<String, usize>,
     #[serde(default)]
@@ -95,11 +96,12 @@ struct BufferView {
     extensions: Refused,
 }
 
-/// Most nodes: scenes of Gaussians have a handful, and a node takes 200 bytes while it is visited.
+/// Largest number of nodes: scenes of Gaussians have a handful, and a node takes 200 bytes while it
+/// is visited.
 const MOST_NODES: usize = 100_000;
 
-/// Reads a `.glb` or `.gltf`: scene axes, SH of the highest degree that any part has. Buffers
-/// outside of the file are read from its own folder only. Notes name what is not read, a line each.
+/// Reads a `.glb` or `.gltf`: scene axes, SH of the highest degree of any part. Buffer files are
+/// read from the folder of the file only. Notes name parts that are not read, a line each.
 pub fn read_noted(path: &Path, notes: &mut Vec<String>) -> Result<Splats> {
     let bytes = files::read(path)?;
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
@@ -112,14 +114,14 @@ fn parse(bytes: &[u8], folder: &Path, notes: &mut Vec<String>) -> Result<Splats,
     root.extensions_required.iter().try_for_each(|name| extensions::required(name))?;
     notes.extend(root.extensions_used.iter().filter_map(|name| extensions::note(name)));
     let document = Document { buffers: contents(&root.buffers, folder)?, root: &root, bin };
-    let placed = document.placed()?;
+    let placed = document.transformed_primitives()?;
     let degrees = placed.iter().map(|(p, _)| Document::sh_degree(p));
     let sh_degree = degrees
         .max()
         .ok_or_else(|| format!("no part of it has the extension {EXTENSION}: not a file of Gaussians"))?;
     document.check_size(&placed, sh_degree, bytes.len())?;
     let mut seen = HashSet::new();
-    // Nodes may show a primitive several times.
+    // Nodes may instantiate a primitive several times.
     for (primitive, _) in placed.iter().filter(|(p, _)| seen.insert(std::ptr::from_ref(*p))) {
         extensions::check(&primitive.extensions[EXTENSION], notes)?;
         notes.extend(unread(primitive));
@@ -133,7 +135,7 @@ fn parse(bytes: &[u8], folder: &Path, notes: &mut Vec<String>) -> Result<Splats,
     for (primitive, by) in placed {
         let mut part = document.primitive(primitive, sh_degree)?;
         transform::transform_splats(&mut part, &by);
-        // The first is most often the only one: not copied.
+        // The first part is most often the only one: moved, not copied.
         if all.is_empty() { all = part } else { all.append(part) }
     }
     transform::transform_splats(&mut all, &turned());
@@ -142,33 +144,36 @@ fn parse(bytes: &[u8], folder: &Path, notes: &mut Vec<String>) -> Result<Splats,
 
 /// The JSON of a file, and the binary chunk of a `.glb`.
 fn chunks(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), String> {
-    let early = || "the file ends early; copy it again".to_owned();
-    let word = |at: usize| -> Result<u32, String> {
-        let b = bytes.get(at..at + 4).ok_or_else(early)?;
-        Ok(u32::from_le_bytes([b[0], b[1], b[2], b[3]]))
-    };
-    if word(0)? != MAGIC {
+    if word(bytes, 0)? != MAGIC {
         return Ok((bytes, None));
     }
-    if word(4)? != 2 {
-        return Err(format!("glTF version {}; only version 2 is known", word(4)?));
+    if word(bytes, 4)? != 2 {
+        return Err(format!("glTF version {}; only version 2 is known", word(bytes, 4)?));
     }
-    if (word(8)? as usize) > bytes.len() {
-        return Err(early());
+    if (word(bytes, 8)? as usize) > bytes.len() {
+        return Err(truncated());
     }
-    let chunk = |at: usize, kind: u32| -> Result<&[u8], String> {
-        let (size, found) = (word(at)? as usize, word(at + 4)?);
-        let body = bytes.get(at + 8..).and_then(|b| b.get(..size)).ok_or_else(early)?;
-        if found == kind {
-            Ok(body)
-        } else {
-            Err("its chunks are not in the order of a .glb file".to_owned())
-        }
-    };
-    let text = chunk(12, JSON_CHUNK)?;
+    let text = chunk(bytes, 12, JSON_CHUNK)?;
     let next = 20 + text.len();
-    let bin = if next < bytes.len() { Some(chunk(next, BIN_CHUNK)?) } else { None };
+    let bin = if next < bytes.len() { Some(chunk(bytes, next, BIN_CHUNK)?) } else { None };
     Ok((text, bin))
+}
+
+fn truncated() -> String {
+    "the file ends early; copy it again".to_owned()
+}
+
+/// The little-endian word at an offset.
+fn word(bytes: &[u8], at: usize) -> Result<u32, String> {
+    let b = bytes.get(at..at + 4).ok_or_else(truncated)?;
+    Ok(u32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+}
+
+/// Content of the chunk at an offset, which must be of a type.
+fn chunk(bytes: &[u8], at: usize, kind: u32) -> Result<&[u8], String> {
+    let (size, found) = (word(bytes, at)? as usize, word(bytes, at + 4)?);
+    let body = bytes.get(at + 8..).and_then(|b| b.get(..size)).ok_or_else(truncated)?;
+    if found == kind { Ok(body) } else { Err("its chunks are not in the order of a .glb file".to_owned()) }
 }
 
 struct Document<'a> {
@@ -178,14 +183,14 @@ struct Document<'a> {
 }
 
 impl<'a> Document<'a> {
-    /// All primitives with the extension below the default scene, and where they are; one for every
-    /// node that shows it.
-    fn placed(&self) -> Result<Vec<(&'a Primitive, Similarity)>, String> {
+    /// All primitives with the extension below the default scene, with their transformations; one
+    /// entry for every node that instantiates them.
+    fn transformed_primitives(&self) -> Result<Vec<(&'a Primitive, Similarity)>, String> {
         let root = self.root;
-        let many = |n: usize| format!("{n} nodes, more than the {MOST_NODES} that are read; merge some");
+        let too_many = |n: usize| format!("{n} nodes, more than the {MOST_NODES} that are read; merge some");
         let top: Vec<usize> = match root.scenes.get(root.scene.unwrap_or(0)) {
             Some(scene) => scene.nodes.clone(),
-            // Without scenes every node that no other has is one.
+            // Without scenes every node without a parent is a root.
             None => {
                 let mut below = vec![false; root.nodes.len()];
                 for child in root.nodes.iter().flat_map(|n| &n.children) {
@@ -195,10 +200,10 @@ impl<'a> Document<'a> {
             }
         };
         if root.nodes.len().max(top.len()) > MOST_NODES {
-            return Err(many(root.nodes.len().max(top.len())));
+            return Err(too_many(root.nodes.len().max(top.len())));
         }
         let mut placed = Vec::new();
-        // Nodes to visit, each with the transformation above it; in a tree no node comes twice.
+        // Nodes to visit, each with the transformation above it; in a tree no node occurs twice.
         let mut open: Vec<(usize, DMat4)> = top.into_iter().rev().map(|n| (n, DMat4::IDENTITY)).collect();
         let mut seen = vec![false; root.nodes.len()];
         while let Some((index, above)) = open.pop() {
@@ -206,19 +211,19 @@ impl<'a> Document<'a> {
             if std::mem::replace(&mut seen[index], true) {
                 return Err(format!("node {index} is below two others; nodes must form a tree"));
             }
-            let matrix = above * local(node);
+            let matrix = above * local_matrix(node);
             for primitive in self.primitives(node)? {
                 placed.push((primitive, similarity(matrix, index)?));
             }
             if open.len() + node.children.len() > MOST_NODES || placed.len() > MOST_NODES {
-                return Err(many(open.len() + node.children.len().max(placed.len())));
+                return Err(too_many(open.len() + node.children.len().max(placed.len())));
             }
             open.extend(node.children.iter().rev().map(|child| (*child, matrix)));
         }
         Ok(placed)
     }
 
-    /// The primitives of a node that have the extension.
+    /// Primitives of a node that have the extension.
     fn primitives(&self, node: &Node) -> Result<impl Iterator<Item = &'a Primitive>, String> {
         let none = &[][..];
         let all = match node.mesh {
@@ -235,8 +240,8 @@ impl<'a> Document<'a> {
         Ok(shown)
     }
 
-    /// Refuses what would take far more memory than the file has bytes: many nodes that show one
-    /// mesh, attributes that share their bytes. Counted before anything of that size is made.
+    /// Refuses files that would take far more memory than they have bytes: many nodes with one
+    /// mesh, attributes that share their bytes. Counted before anything of that size is allocated.
     fn check_size(
         &self,
         placed: &[(&Primitive, Similarity)],
@@ -268,8 +273,8 @@ impl<'a> Document<'a> {
         (1..=3).rev().find(has).unwrap_or(0)
     }
 
-    /// The Gaussians of a primitive in the axes of its node; coefficients up to `sh_degree` that it
-    /// lacks are zero.
+    /// Gaussians of a primitive in the axes of its node; missing coefficients up to `sh_degree` are
+    /// zero.
     fn primitive(&self, primitive: &Primitive, sh_degree: u32) -> Result<Splats, String> {
         if primitive.mode != Some(0) {
             return Err("Gaussians must be points (mode 0)".to_owned());
@@ -277,7 +282,7 @@ impl<'a> Document<'a> {
         let means: Vec<[f32; 3]> = self.vectors(primitive, "POSITION", "VEC3")?.collect();
         let mut s = Splats { sh_degree, means, ..Splats::default() };
         let (n, width) = (s.len(), 3 * s.sh_len());
-        let counted = |found: usize| match found == n {
+        let check_count = |found: usize| match found == n {
             true => Ok(()),
             false => Err("its attributes have different numbers of Gaussians".to_owned()),
         };
@@ -287,7 +292,7 @@ impl<'a> Document<'a> {
         s.log_scales = scales.collect();
         let opacities = self.vectors(primitive, &attribute("OPACITY"), "SCALAR")?;
         s.opacity_logits = opacities.map(|[a]| logit(a)).collect();
-        [s.quats.len(), s.log_scales.len(), s.opacity_logits.len()].into_iter().try_for_each(counted)?;
+        [s.quats.len(), s.log_scales.len(), s.opacity_logits.len()].into_iter().try_for_each(check_count)?;
         if s.log_scales.as_flattened().iter().any(|v| *v < 0.0) {
             return Err(
                 "a scale is negative: drafts of the extension held logarithms; export the file again"
@@ -301,7 +306,7 @@ impl<'a> Document<'a> {
         for degree in 0..=Document::sh_degree(primitive) {
             for k in 0..=2 * degree {
                 let column = self.vectors::<3>(primitive, &coefficient(degree, k), "VEC3")?;
-                counted(column.len())?;
+                check_count(column.len())?;
                 let first = 3 * (degree * degree + k) as usize;
                 for (row, value) in s.sh.chunks_exact_mut(width).zip(column) {
                     row[first..first + 3].copy_from_slice(&value);
@@ -311,7 +316,7 @@ impl<'a> Document<'a> {
         Ok(s)
     }
 
-    /// An attribute as floats, whatever the file stores it in.
+    /// An attribute as floats, from any stored component type.
     fn vectors<'s, const N: usize>(
         &'s self,
         primitive: &Primitive,
@@ -356,7 +361,7 @@ impl<'a> Document<'a> {
     }
 }
 
-/// Notes on attributes of the extension that are not read, those of higher SH degrees among them.
+/// Notes on attributes of the extension that are not read, such as those of higher SH degrees.
 fn unread(primitive: &Primitive) -> Vec<String> {
     let degrees = (0..=degree::MOST_DEGREE).flat_map(|l| (0..=2 * l).map(move |n| coefficient(l, n)));
     let read: Vec<String> =
@@ -375,7 +380,7 @@ fn coefficient(degree: u32, n: u32) -> String {
     attribute(&format!("SH_DEGREE_{degree}_COEF_{n}"))
 }
 
-/// How a number is stored; `one` is what stands for 1.
+/// Storage of a component; `one` is the stored value of 1.
 struct Component {
     bytes: usize,
     read: fn(&[u8]) -> f32,
@@ -402,7 +407,7 @@ impl Component {
     }
 }
 
-fn local(node: &Node) -> DMat4 {
+fn local_matrix(node: &Node) -> DMat4 {
     if let Some(matrix) = &node.matrix {
         return DMat4::from_cols_array(matrix);
     }
@@ -414,7 +419,7 @@ fn local(node: &Node) -> DMat4 {
     )
 }
 
-/// A transformation that keeps Gaussians what they are: no shear, no mirror, one scale.
+/// The similarity of a matrix; refuses shear, mirroring and non-uniform scale.
 fn similarity(matrix: DMat4, node: usize) -> Result<Similarity, String> {
     let linear = DMat3::from_mat4(matrix);
     let scale = linear.determinant().cbrt();

@@ -1,4 +1,4 @@
-//! Writing.
+//! Writer.
 use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
 use crate::format::gaussians::usable;
 use crate::format::transform;
@@ -19,25 +19,27 @@ pub fn write_glb(path: &Path, splats: &Splats) -> Result<()> {
     let mut text = root.to_string().into_bytes();
     text.resize(text.len().next_multiple_of(4), b' ');
     let total = 12 + 8 + text.len() + 8 + data.len();
-    let word = |n: usize| {
-        u32::try_from(n).map(u32::to_le_bytes).map_err(|_| {
-            let path = path.display();
-            Error::work(format!("{path}: more than the 4 GiB of a .glb file; write a .ply instead"))
-        })
-    };
     let mut out = Vec::with_capacity(total);
-    for bytes in [MAGIC.to_le_bytes(), 2u32.to_le_bytes(), word(total)?] {
+    for bytes in [MAGIC.to_le_bytes(), 2u32.to_le_bytes(), size_bytes(total, path)?] {
         out.extend(bytes);
     }
     for (chunk, kind) in [(text, JSON_CHUNK), (data, BIN_CHUNK)] {
-        out.extend(word(chunk.len())?);
+        out.extend(size_bytes(chunk.len(), path)?);
         out.extend(kind.to_le_bytes());
         out.extend(chunk);
     }
     std::fs::write(path, out).map_err(Error::unwritable(path))
 }
 
-/// Writes one text file with the numbers inside it, in the order of the scene.
+/// Bytes of a size in a `.glb`.
+fn size_bytes(n: usize, path: &Path) -> Result<[u8; 4]> {
+    u32::try_from(n).map(u32::to_le_bytes).map_err(|_| {
+        let path = path.display();
+        Error::work(format!("{path}: more than the 4 GiB of a .glb file; write a .ply instead"))
+    })
+}
+
+/// Writes one text file with the buffer as a data URI, in the order of the scene.
 pub fn write_gltf(path: &Path, splats: &Splats) -> Result<()> {
     usable::check_written(splats)?;
     let (mut root, data) = document(splats);
@@ -46,7 +48,7 @@ pub fn write_gltf(path: &Path, splats: &Splats) -> Result<()> {
     std::fs::write(path, root.to_string()).map_err(Error::unwritable(path))
 }
 
-/// The document without its buffer, and the buffer.
+/// Document without its buffer, and the buffer.
 fn document(splats: &Splats) -> (Value, Vec<u8>) {
     let mut s = splats.clone();
     transform::transform_splats(&mut s, &turned());
@@ -113,13 +115,13 @@ fn document(splats: &Splats) -> (Value, Vec<u8>) {
     (root, parts.data)
 }
 
-/// The base colour of a splat in linear light, as glTF's vertex colours are.
+/// Base colour of a splat in linear light, as glTF's vertex colours are.
 fn linear(dc: f32) -> f32 {
     let v = (0.5 + SH_C0 * dc).clamp(0.0, 1.0);
     to_linear(v)
 }
 
-/// Attributes one after the other in one buffer.
+/// Attributes, one after the other in one buffer.
 #[derive(Default)]
 struct Parts {
     count: usize,

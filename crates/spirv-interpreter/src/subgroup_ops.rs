@@ -1,9 +1,9 @@
-//! What the invocations of a subgroup compute together.
+//! Operations between the invocations of a subgroup.
 use crate::code::{GARBAGE, Reduction, Reg, Subgroup as Op};
 use crate::faults::{Fault, Faults};
 use crate::subgroup::Subgroup;
 
-fn reduced(op: Reduction, a: u32, b: u32) -> u32 {
+fn combine(op: Reduction, a: u32, b: u32) -> u32 {
     match op {
         Reduction::IAdd => a.wrapping_add(b),
         Reduction::FAdd => (f32::from_bits(a) + f32::from_bits(b)).to_bits(),
@@ -12,9 +12,9 @@ fn reduced(op: Reduction, a: u32, b: u32) -> u32 {
 }
 
 impl Subgroup {
-    /// Demands that all invocations take part: where some have gone another way, Vulkan does not
-    /// say that the others have met again.
-    pub(crate) fn together(&mut self, op: Op, to: Reg, (a, b): (Reg, Reg), at: u32, faults: &mut Faults) {
+    /// Runs a subgroup operation. A fault if not all invocations take part: Vulkan does not
+    /// guarantee that diverged invocations have reconverged.
+    pub(crate) fn subgroup_op(&mut self, op: Op, to: Reg, (a, b): (Reg, Reg), at: u32, faults: &mut Faults) {
         let lanes = self.locals.len();
         if self.active.len() != lanes {
             faults
@@ -23,7 +23,7 @@ impl Subgroup {
         let mut here = vec![false; self.size];
         self.active.iter().for_each(|&l| here[l] = true);
         let values: Vec<u32> = (0..lanes).map(|l| self.get(a, l)).collect();
-        // Sums go up the lanes in whichever order the rest does.
+        // Sums run in ascending order of lanes, whatever the order of execution.
         let mut ascending = self.active.clone();
         ascending.sort_unstable();
         let vote = |l: &usize| values[*l] != 0;
@@ -53,14 +53,14 @@ impl Subgroup {
                 }
             }
             Op::Reduce(r) => {
-                let sum = ascending.iter().map(|l| values[*l]).reduce(|a, b| reduced(r, a, b));
+                let sum = ascending.iter().map(|l| values[*l]).reduce(|a, b| combine(r, a, b));
                 fill(self, sum.unwrap_or(0));
             }
-            // 0 changes no sum, also of floats, and no largest unsigned number.
+            // 0 is neutral for sums, also of floats, and for the maximum of unsigned numbers.
             Op::Inclusive(r) | Op::Exclusive(r) => {
                 let mut sum = 0;
                 for &lane in &ascending {
-                    let next = reduced(r, sum, values[lane]);
+                    let next = combine(r, sum, values[lane]);
                     self.set(to, lane, if matches!(op, Op::Inclusive(_)) { next } else { sum });
                     sum = next;
                 }
