@@ -121,6 +121,7 @@ impl QueryResult {
 }
 
 /// Relevancy of every code, [K]: `min_i σ(10 (φ·q − φ·n_i))` (docs/internals/method.md#relevancy).
+/// Answers take [`field_relevancy`], which also limits codes of another colour than the query's.
 pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>> {
     let d = codebook.embedding_dim;
     if codebook.is_empty() {
@@ -174,7 +175,8 @@ pub fn answer_all(
     frames.par_iter().map(|codes| answer_with(codes, &relevancy, options)).collect()
 }
 
-/// [`code_relevancy`] of every level, for codes of the colour that the query names.
+/// [`code_relevancy`] of every level; codes that fit another colour than the query's are limited to
+/// 0.5.
 pub fn field_relevancy(field: &LanguageField, query: &TextQuery) -> Result<Vec<Vec<f32>>> {
     field.levels.iter().map(|level| level_relevancy(level, query)).collect()
 }
