@@ -131,6 +131,8 @@ mod tests {
     }
 
     #[test]
+
+    #[ignore = "takes long: tools/test-long"]
     fn detect_matches_patch_at_70_degrees() {
         let image = texture(360, 300);
         let middle = DVec2::new(180.0, 150.0);

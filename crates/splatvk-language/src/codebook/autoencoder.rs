@@ -260,6 +260,8 @@ mod tests {
     }
 
     #[test]
+
+    #[ignore = "takes long: tools/test-long"]
     fn lattice_covers_sphere_and_decodes() {
         let codes = lattice();
         let probe = unit_rows(500, 3, 1001);

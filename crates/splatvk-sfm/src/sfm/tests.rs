@@ -148,6 +148,8 @@ fn reconstruct_two_photos_with_exif() {
 }
 
 #[test]
+
+#[ignore = "takes long: tools/test-long"]
 fn reconstruct_finds_only_real_distortion() {
     let truth = testing::train(&testing::folder());
     let focal = truth.cameras[0].fx;
@@ -190,6 +192,8 @@ fn agreement_low_only_for_wrong_view() {
 }
 
 #[test]
+
+#[ignore = "takes long: tools/test-long"]
 fn reconstruct_75_degrees_has_low_confidence() {
     let truth = testing::train(&testing::folder());
     let outer = [truth.photos[0].clone(), truth.photos[3].clone()];
@@ -207,6 +211,8 @@ fn reconstruct_75_degrees_has_low_confidence() {
 }
 
 #[test]
+
+#[ignore = "takes long: tools/test-long"]
 fn affine_features_match_75_degrees() {
     let truth = testing::train(&testing::folder());
     let outer = [truth.photos[0].clone(), truth.photos[3].clone()];
@@ -378,6 +384,8 @@ fn moved(photo: &Photo, shift: [i32; 2]) -> Photo {
 }
 
 #[test]
+
+#[ignore = "takes long: tools/test-long"]
 fn reconstruct_stabilised_lens_keeps_one_camera() {
     let truth = testing::train(&testing::folder());
     let shifts = [[0, 0], [12, -6], [-10, 8], [6, 10]];
@@ -409,6 +417,8 @@ fn equal_exif_shares_intrinsics() {
 }
 
 #[test]
+
+#[ignore = "takes long: tools/test-long"]
 fn fine_images_improve_cameras() {
     let mut truth = testing::train(&testing::folder());
     let photos = std::mem::take(&mut truth.photos);
