@@ -80,7 +80,7 @@ pub struct MovedArgs {
 }
 
 impl Command {
-    /// Where a command that loads networks keeps `--provider`.
+    /// Field `--provider` of commands that load networks.
     pub fn provider(&mut self) -> Option<&mut Option<String>> {
         let device = match self {
             Command::Run(args) => &mut args.device,
@@ -139,7 +139,7 @@ pub struct TrainArgs {
     pub device: DeviceArgs,
 }
 
-/// What `render` can write.
+/// Outputs of `render`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Channel {
     /// Colour
@@ -156,7 +156,7 @@ pub enum Channel {
     Unseen,
 }
 
-/// How `render` writes it.
+/// File formats of `render`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ImageFormat {
     /// 8-bit preview
@@ -233,7 +233,7 @@ pub struct ViewArgs {
     pub device: DeviceArgs,
 }
 
-/// Which labels `eval` reads, how it cuts masks and what it counts.
+/// Labels, masks and scores of `eval`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum ProtocolArg {
     /// ground_truth.json: poses, images, depth, masks from codes; the default

@@ -1,6 +1,6 @@
 //! `splatvk bench`
 use super::args::{BenchArgs, BenchPart};
-use super::models::checked;
+use super::models::check_text;
 use super::outputs::{WrittenFile, WrittenFiles};
 use super::print::{listing, print};
 use super::progress;
@@ -41,11 +41,11 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
             return Ok(());
         }
     }
-    // Everything that can be wrong with the input comes before the first measurement.
+    // All input is validated before the first measurement.
     let workload =
         if has(BenchPart::Training) || !args.sweep.is_empty() { Some(workload(args)?) } else { None };
-    let asked = if has(BenchPart::Query) { Some(scene_and_encoder(args)?) } else { None };
-    let out = writable(args)?;
+    let queried = if has(BenchPart::Query) { Some(scene_and_encoder(args)?) } else { None };
+    let out = report_file(args)?;
     let device = gpu::open(args.device.as_deref())?;
     let mut bench = Bench::new(&device, budget)?;
     if let Some(workload) = &workload {
@@ -59,15 +59,15 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
     if has(BenchPart::Sort) {
         bench.sort(args.keys)?;
     }
-    if let Some((scene, encoder)) = asked {
+    if let Some((scene, encoder)) = queried {
         let field = scene.language.ok_or_else(|| Error::work("the scene lost its language"))?;
         bench.query((&scene.splats, field, &scene.cameras), encoder, &args.query)?;
     }
-    keep(out, &bench.report)?;
+    write_report(out, &bench.report)?;
     print(&bench.report.table())
 }
 
-/// What clap cannot check; the budget of each measurement.
+/// Validates options beyond clap's checks; returns the budget of each measurement.
 fn check(args: &BenchArgs) -> Result<Budget> {
     if !(args.seconds > 0.0 && args.seconds.is_finite()) {
         return Err(Error::input(format!("--seconds {}: give a positive number", args.seconds)));
@@ -97,45 +97,45 @@ fn workload(args: &BenchArgs) -> Result<Workload> {
     }
 }
 
-/// Seconds and peak memory per step of every installed network.
+/// Measures seconds and peak memory per step of every installed network.
 fn models(registry: &Registry) -> Result<()> {
     let found = inventory(registry);
     if found.models.is_empty() {
         return Err(Error::input("bench models: no network is installed; see splatvk models list"));
     }
     for model in &found.models {
-        print(&checked(model, Some(&check_model(model)?)))?;
+        print(&check_text(model, Some(&check_model(model)?)))?;
     }
     Ok(())
 }
 
-/// Photos → cameras on data with a known answer; needs no device.
+/// Measures photos → cameras on data with ground truth; needs no device.
 fn cameras(args: &BenchArgs) -> Result<()> {
-    let (registry, out) = of_data(args, "cameras")?;
-    let reading =
+    let (registry, out) = data_options(args, "cameras")?;
+    let input =
         bench::cameras::PhotoInput { max_size: args.max_size, copies: args.copies, pairs: args.pairs };
     let progress = progress::reporter();
     let mut header = Some(bench::cameras::header());
     let mut show =
         |row: &bench::cameras::CameraRow| print(&(header.take().unwrap_or_default() + &row.text()));
-    let report = bench::cameras::measure(&args.data, reading, &registry, progress.as_ref(), &mut show)?;
-    keep(out, &report)?;
+    let report = bench::cameras::measure(&args.data, input, &registry, progress.as_ref(), &mut show)?;
+    write_report(out, &report)?;
     print(&report.text())
 }
 
-/// Photos → masks on data with true masks; needs no device.
+/// Measures photos → masks on data with ground truth; needs no device.
 fn masks(args: &BenchArgs) -> Result<()> {
-    let (registry, out) = of_data(args, "masks")?;
+    let (registry, out) = data_options(args, "masks")?;
     let progress = progress::reporter();
     let mut header = Some(bench::masks::header());
     let mut show = |row: &bench::masks::MaskRow| print(&(header.take().unwrap_or_default() + &row.text()));
     let report = bench::masks::measure(&args.data, args.max_size, &registry, progress.as_ref(), &mut show)?;
-    keep(out, &report)?;
+    write_report(out, &report)?;
     print(&report.text())
 }
 
-/// Checks the options of a part that reads folders with ground truth and runs by itself.
-fn of_data(args: &BenchArgs, part: &str) -> Result<(Registry, Option<WrittenFile>)> {
+/// Validates the options of a part that reads folders with ground truth and runs alone.
+fn data_options(args: &BenchArgs, part: &str) -> Result<(Registry, Option<WrittenFile>)> {
     if args.parts.len() > 1 {
         return Err(Error::input(format!("bench {part}: runs alone; leave the other parts out")));
     }
@@ -144,11 +144,11 @@ fn of_data(args: &BenchArgs, part: &str) -> Result<(Registry, Option<WrittenFile
             "bench {part}: give folders with ground_truth.json with --data DIR..."
         )));
     }
-    Ok((args.registry()?, writable(args)?))
+    Ok((args.registry()?, report_file(args)?))
 }
 
-/// Writes the report where `--json` says.
-fn keep(out: Option<WrittenFile>, report: &impl serde::Serialize) -> Result<()> {
+/// Writes the report to the file of `--json`.
+fn write_report(out: Option<WrittenFile>, report: &impl serde::Serialize) -> Result<()> {
     out.map_or(Ok(()), |out| out.keep(|file| write_json(file, report)))
 }
 
@@ -166,8 +166,8 @@ fn scene_and_encoder(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn Regi
     Ok((scene, encoder))
 }
 
-/// Finds out before the measurements take their time whether the result can be kept.
-fn writable(args: &BenchArgs) -> Result<Option<WrittenFile>> {
+/// Reserves the file of `--json` before the measurements.
+fn report_file(args: &BenchArgs) -> Result<Option<WrittenFile>> {
     let inputs: Vec<&Path> = [args.scene.as_deref(), args.camera.as_deref()].into_iter().flatten().collect();
     args.json.as_deref().map(|file| WrittenFile::open(file, args.force, &inputs)).transpose()
 }

@@ -1,4 +1,4 @@
-//! `splatvk clean`: what earlier runs left to be used again, and how to free it.
+//! `splatvk clean`: lists and frees files of earlier runs that later runs would reuse.
 use super::args::CleanArgs;
 use super::print::{print, print_json};
 use crate::fetch;
@@ -6,85 +6,88 @@ use crate::files::{leftovers, remove_leftover};
 use crate::infer::{Registry, cache};
 use crate::pipeline::Store;
 use crate::{Error, Result};
-use serde_json::json;
+use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Most things of a kind that are listed.
+/// Maximum number of listed files per kind.
 const LISTED: usize = 20;
 
-/// Kept things of one kind.
-struct KeptRow {
-    what: &'static str,
+/// Kept files of one kind.
+struct KeptFiles {
+    kind: &'static str,
     folder: PathBuf,
-    things: Vec<(PathBuf, u64)>,
+    files: Vec<(PathBuf, u64)>,
 }
 
-impl KeptRow {
+impl KeptFiles {
     fn bytes(&self) -> u64 {
-        self.things.iter().map(|f| f.1).sum()
+        self.files.iter().map(|f| f.1).sum()
     }
 
-    /// A line for each thing, or for the first of many.
-    fn listed(&self) -> String {
+    fn json(&self) -> Value {
+        let paths: Vec<String> = self.files.iter().map(|(path, _)| path.display().to_string()).collect();
+        json!({
+            "what": self.kind, "folder": self.folder, "files": self.files.len(), "bytes": self.bytes(), "paths": paths,
+        })
+    }
+
+    /// A line per file, up to [`LISTED`].
+    fn listing(&self) -> String {
         let line = |(path, _): &(PathBuf, u64)| format!("  {}\n", path.display());
-        let more = match self.things.len().saturating_sub(LISTED) {
+        let more = match self.files.len().saturating_sub(LISTED) {
             0 => String::new(),
             more => format!("  and {more} more\n"),
         };
-        self.things.iter().take(LISTED).map(line).collect::<String>() + &more
+        self.files.iter().take(LISTED).map(line).collect::<String>() + &more
     }
 }
 
 pub fn clean(args: &CleanArgs) -> Result<()> {
     let (stages, answers) = (crate::run::stage_folder()?, cache::folder()?);
     let mut rows = vec![
-        KeptRow {
-            what: "stages of runs, for --resume",
-            things: [Store::list(&stages), partial(&stages)].concat(),
+        KeptFiles {
+            kind: "stages of runs, for --resume",
+            files: [Store::list(&stages), unfinished_in(&stages)].concat(),
             folder: stages,
         },
-        KeptRow {
-            what: "answers of networks",
-            things: [cache::files(&answers), partial(&answers), partial(&answers.join("sums"))].concat(),
+        KeptFiles {
+            kind: "answers of networks",
+            files: [cache::files(&answers), unfinished_in(&answers), unfinished_in(&answers.join("sums"))]
+                .concat(),
             folder: answers,
         },
     ];
-    rows.extend(Registry::places(args.models.as_deref())?.into_iter().map(|folder| KeptRow {
-        what: "models that were fetched in part",
-        things: fetch::leftovers(&folder),
+    rows.extend(Registry::places(args.models.as_deref())?.into_iter().map(|folder| KeptFiles {
+        kind: "models that were fetched in part",
+        files: fetch::leftovers(&folder),
         folder,
     }));
-    rows.push(KeptRow {
-        what: "unfinished files of commands that were killed",
-        things: unfinished(&args.folders)?,
+    rows.push(KeptFiles {
+        kind: "unfinished files of commands that were killed",
+        files: unfinished(&args.folders)?,
         folder: PathBuf::from("."),
     });
     if args.delete {
         for row in &rows {
-            row.things.iter().try_for_each(|(path, _)| remove(path))?;
+            row.files.iter().try_for_each(|(path, _)| remove(path))?;
         }
     }
     if args.json {
-        let one = |r: &KeptRow| {
-            let paths: Vec<String> = r.things.iter().map(|(path, _)| path.display().to_string()).collect();
-            json!({ "what": r.what, "folder": r.folder, "files": r.things.len(), "bytes": r.bytes(), "paths": paths })
-        };
-        return print_json(
-            &json!({ "deleted": args.delete, "kept": rows.iter().map(one).collect::<Vec<_>>() }),
-        );
+        let kept: Vec<_> = rows.iter().map(KeptFiles::json).collect();
+        return print_json(&json!({ "deleted": args.delete, "kept": kept }));
     }
     let verb = if args.delete { "freed" } else { "holds" };
     for r in &rows {
         let size = r.bytes() as f64 / f64::from(1 << 20);
         print(&format!(
             "{}: {verb} {size:.1} MiB in {} files ({})\n",
-            r.what,
-            r.things.len(),
+            r.kind,
+            r.files.len(),
             r.folder.display()
         ))?;
         if !args.delete {
-            print(&r.listed())?;
+            print(&r.listing())?;
         }
     }
     match args.delete {
@@ -95,13 +98,13 @@ pub fn clean(args: &CleanArgs) -> Result<()> {
     }
 }
 
-/// What processes that are gone have begun in a folder of the program's own.
-fn partial(folder: &Path) -> Vec<(PathBuf, u64)> {
+/// Unfinished files of dead processes in a folder of the program, with their sizes.
+fn unfinished_in(folder: &Path) -> Vec<(PathBuf, u64)> {
     leftovers(folder).into_iter().map(|path| (path.clone(), size(&path))).collect()
 }
 
-/// What processes that are gone have begun in the current folder, in out/ and in `folders`, and in
-/// the folders of each.
+/// Unfinished files of dead processes in the current folder, in out/ and in `folders`, and in the
+/// folders directly below each.
 fn unfinished(folders: &[PathBuf]) -> Result<Vec<(PathBuf, u64)>> {
     let mut found = BTreeMap::new();
     for folder in [Path::new("."), Path::new("out")].into_iter().chain(folders.iter().map(PathBuf::as_path)) {
@@ -110,12 +113,12 @@ fn unfinished(folders: &[PathBuf]) -> Result<Vec<(PathBuf, u64)>> {
             Err(_) if folder == Path::new("out") => continue,
             Err(e) => return Err(Error::io(folder)(e)),
         };
-        // Links are not followed: what they lead to is not below.
+        // Links are not followed: they lead elsewhere.
         let below = entries.flatten().filter(|e| e.file_type().is_ok_and(|t| t.is_dir())).map(|e| e.path());
         for folder in below.chain([folder.to_path_buf()]) {
-            // Each folder once, under whichever name.
+            // Each folder once, by its canonical path.
             let Ok(whole) = folder.canonicalize() else { continue };
-            found.entry(whole).or_insert_with(|| partial(&folder));
+            found.entry(whole).or_insert_with(|| unfinished_in(&folder));
         }
     }
     Ok(found.into_values().flatten().collect())
@@ -132,7 +135,7 @@ fn size(path: &Path) -> u64 {
     }
 }
 
-/// Removes a file, or, by its mark, a folder of unfinished work. What another process has removed
+/// Removes a file, or a marked folder of unfinished work. One that another process removed
 /// meanwhile is no error.
 fn remove(path: &Path) -> Result<()> {
     let removed = match path.symlink_metadata() {

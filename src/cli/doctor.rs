@@ -1,4 +1,4 @@
-//! `splatvk doctor`: what this machine has, and what to do about what it lacks.
+//! `splatvk doctor`: state of this machine, with advice on missing parts.
 use super::args::DoctorArgs;
 use super::models;
 use super::print::{print, print_json};
@@ -50,11 +50,11 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
         .map(Task::name)
         .collect();
     if !lacking.is_empty() {
-        // The built-in ways do without.
+        // The built-in sources need no networks.
         let advice = "splatvk models fetch open gets those that are recommended".to_owned();
         lines.push(line("networks", Status::Note, format!("none for {}", lacking.join(", ")), Some(advice)));
     }
-    // Photos of other kinds are read without it, so this is no fault of the machine.
+    // Other photo formats work without it, so the machine is still ready.
     let Support { found, advice } = photo::heif_support();
     lines.push(line("HEIC, AVIF", if advice.is_some() { Status::Note } else { Status::Ok }, found, advice));
     let Support { found, advice } = photo::video_support();
@@ -78,9 +78,10 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
     }
 }
 
-/// Compares every pass with its CPU reference, and switches off what is wrong and can be replaced.
+/// Compares every pass with its CPU reference, and disables wrong kernel variants that have a
+/// replacement.
 fn check_passes(args: &DoctorArgs) -> Result<()> {
-    // Without the cache nothing is disabled, and the driver compiles everything.
+    // Without the cache no variant is disabled, and the driver compiles every shader.
     let options = Options { cache: None, ..gpu::options(args.device.device.as_deref()) };
     let device = Device::open(&options)?;
     let info = device.info();
@@ -130,7 +131,7 @@ fn check_passes(args: &DoctorArgs) -> Result<()> {
 fn text(row: &Row) -> String {
     let (word, found) = match &row.outcome {
         Ok(found) => ("ok", found),
-        Err(what) => ("WRONG", what),
+        Err(problem) => ("WRONG", problem),
     };
     let pass = row.variant.map_or(row.pass.to_owned(), |variant| format!("{}, {}", row.pass, variant.name()));
     format!("{word:<6} {pass:<52} {:>6} ms  {found}\n", row.time.as_millis())
@@ -141,7 +142,7 @@ fn to_json(row: &Row) -> serde_json::Value {
         "pass": row.pass,
         "way": row.variant.map(|v| v.name()),
         "right": row.outcome.is_ok(),
-        "found": row.outcome.as_ref().unwrap_or_else(|what| what),
+        "found": row.outcome.as_ref().unwrap_or_else(|problem| problem),
         "seconds": row.time.as_secs_f64(),
     })
 }

@@ -36,8 +36,8 @@ pub fn eval(args: &EvalArgs) -> Result<()> {
             "--cameras: with --protocol field the cameras stand in ground_truth.json; leave it out",
         )),
         ProtocolArg::Field => {
-            let found = field(&scene, args, out.as_ref())?;
-            report(&found, args, out, Some(found.text()))
+            let scores = score_scene(&scene, args, out.as_ref())?;
+            report(&scores, args, out, Some(scores.text()))
         }
         _ if args.refine_views || args.text || args.compat.is_some() => Err(Error::input(
             "--refine-views, --text and --compat belong to --protocol field; leave them out",
@@ -54,8 +54,8 @@ pub fn eval(args: &EvalArgs) -> Result<()> {
     }
 }
 
-/// The texts in the scene's space; none where it has no language.
-fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery>> {
+/// Queries of the texts in the scene's space; none for a scene without language.
+fn embed(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery>> {
     if scene.language.is_none() || texts.is_empty() {
         return Ok(Vec::new());
     }
@@ -66,7 +66,7 @@ fn ask(scene: &Scene, texts: &[String], args: &EvalArgs) -> Result<Vec<TextQuery
     Ok(queries)
 }
 
-fn field(scene: &Scene, args: &EvalArgs, out: Option<&WrittenFiles>) -> Result<EvalReport> {
+fn score_scene(scene: &Scene, args: &EvalArgs, out: Option<&WrittenFiles>) -> Result<EvalReport> {
     let truth = GroundTruth::read(&args.ground_truth)?;
     if let Some(doubt) = truth.check(scene.language.is_some())? {
         progress::print_warning(&doubt);
@@ -74,10 +74,10 @@ fn field(scene: &Scene, args: &EvalArgs, out: Option<&WrittenFiles>) -> Result<E
     let mut evaluation = Evaluation::new(truth, &scene.cameras, out.map(WrittenFiles::folder))?;
     evaluation.add_world(&scene.world);
     let phrases: Vec<String> = evaluation.phrases().into_iter().map(|p| p.1).collect();
-    let queries = ask(scene, &phrases, args)?;
+    let queries = embed(scene, &phrases, args)?;
     let device = gpu::open(args.device.device.as_deref())?;
-    let nothing = LanguageField::default();
-    let field = scene.language.as_ref().unwrap_or(&nothing);
+    let no_language = LanguageField::default();
+    let field = scene.language.as_ref().unwrap_or(&no_language);
     score_field(
         &device,
         &scene.splats,
@@ -104,7 +104,7 @@ fn published(
     };
     let known = args.cameras.as_deref().map(views::read).transpose()?.unwrap_or_default();
     let mut protocol = protocol::open(kind, &args.ground_truth, &scene.cameras, &known)?;
-    let queries = ask(scene, &protocol.prompts(), args)?;
+    let queries = embed(scene, &protocol.prompts(), args)?;
     let scores = CodeScores::new(field, &queries)?;
     let device = gpu::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
@@ -133,7 +133,7 @@ fn write(out: &mut WrittenFiles, stem: &str, rgb: &crate::scene::RgbImage, masks
     Ok(())
 }
 
-/// The report is JSON unless `--text` is given; `--json` keeps it on one line.
+/// Writes and prints the report: JSON unless `--text` is given, on one line with `--json`.
 fn report(
     report: &impl Serialize,
     args: &EvalArgs,

@@ -75,7 +75,7 @@ fn up_axis(text: &str) -> Result<UpAxis, String> {
     }
 }
 
-/// What `--up` and `--metres` ask for, from the scene's own coordinates.
+/// Transform of `--up` and `--metres` from the scene's own coordinates; `None` without them.
 fn placement(scene: &Scene, args: &ExportArgs, format: &str) -> Result<Option<Similarity>> {
     let scale = match (args.metres, &scene.world.scale) {
         (false, _) => 1.0,
@@ -98,7 +98,7 @@ fn rotation(scene: &Scene, args: &ExportArgs, format: &str) -> Result<DMat3> {
         Error::input(format!("{}: which way is up is not known; leave --up out", args.scene.display()))
     })?;
     let axis = match SplatFormat::named(format) {
-        // Their writers turn right, down, forward to right, up, back.
+        // Their writers convert right, down, forward to right, up, back.
         Some(format) if format.y_up => match axis {
             UpAxis::PlusY => UpAxis::MinusY,
             _ => {
@@ -113,8 +113,8 @@ fn rotation(scene: &Scene, args: &ExportArgs, format: &str) -> Result<DMat3> {
     Ok(up.levelled(axis))
 }
 
-/// Moves everything that a scene has in space.
-fn place(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Similarity) {
+/// Transforms splats, cameras and points of a scene.
+fn transform_scene(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Similarity) {
     let levels = scene.language.iter_mut().flat_map(|field| &mut field.levels);
     let own = levels.filter_map(|level| level.splats.as_mut());
     own.chain([&mut scene.splats]).for_each(|splats| transform_splats(splats, by));
@@ -129,7 +129,7 @@ fn place(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Similarity) {
 
 pub fn export(args: &ExportArgs) -> Result<()> {
     let format = format(args)?;
-    let out = Out::reserve(args, format)?;
+    let out = Output::reserve(args, format)?;
     let mut scene = scene::load(&args.scene)?;
     if args.only_seen {
         keep_seen(&mut scene, args)?;
@@ -140,11 +140,11 @@ pub fn export(args: &ExportArgs) -> Result<()> {
         false => None,
     };
     if let Some(by) = placement {
-        place(&mut scene, &mut points, &by);
+        transform_scene(&mut scene, &mut points, &by);
     }
     progress::reporter().check()?;
     match out {
-        Out::Folder(mut folder) => {
+        Output::Folder(mut folder) => {
             let cameras = cameras(&scene, args)?;
             let [text, binary] = colmap::FILES;
             let (write, other): (fn(&_, &_, _) -> _, _) = match format {
@@ -155,17 +155,17 @@ pub fn export(args: &ExportArgs) -> Result<()> {
             folder.outdate(other.into_iter());
             folder.keep()?;
         }
-        Out::Splats(files, of_splats) => {
-            warn_of_losses(&scene.splats, of_splats);
+        Output::Splats(files, splat_format) => {
+            warn_of_losses(&scene.splats, splat_format);
             warn_of_models(&scene);
             let options = WriteOptions { spz_version: args.spz_version.unwrap_or(spz::DEFAULT_VERSION) };
-            files.write(&scene.splats, scene.language.as_ref(), of_splats, options)?;
+            files.write(&scene.splats, scene.language.as_ref(), splat_format, options)?;
         }
-        Out::File(file) if format == "transforms" => {
+        Output::File(file) if format == "transforms" => {
             let cameras = cameras(&scene, args)?;
             file.keep(|path| transforms::write(path, cameras, None))?;
         }
-        Out::File(file) => {
+        Output::File(file) => {
             let language = if args.with_features { scene.language.as_ref() } else { None };
             if args.with_features && language.is_none() {
                 return Err(Error::input(format!(
@@ -186,29 +186,27 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     listing(std::slice::from_ref(&args.out), args.json)
 }
 
-/// Where a format goes.
-enum Out {
+/// Reserved output of a format.
+enum Output {
     /// The files of a COLMAP model.
     Folder(WrittenFiles),
-    /// One file: cameras, or a PLY, which alone of all formats can hold the language itself, and
-    /// any degree.
+    /// One file: cameras, or a PLY, the only format with language inside and any SH degree.
     File(WrittenFile),
-    /// Splats, and the language beside them.
+    /// Splats, with the language beside them.
     Splats(Reserved, &'static SplatFormat),
 }
 
-impl Out {
-    /// Refuses a place that may not be written before the scene is read.
-    fn reserve(args: &ExportArgs, format: &str) -> Result<Out> {
+impl Output {
+    /// Reserves the output, or refuses a place that may not be written, before the scene is read.
+    fn reserve(args: &ExportArgs, format: &str) -> Result<Output> {
         let is_folder = format.starts_with("colmap");
         if args.spz_version.is_some() && format != "spz" {
             return Err(Error::input("--spz-version: only --format spz has versions; leave it out"));
         }
         check_ending(&args.out, format)?;
-        // A link is said to be one wherever it leads.
+        // Refuses a link wherever it leads.
         check_place(&args.out, if is_folder { Kind::Folder } else { Kind::File }, true)?;
-        let whole = |p: &Path| p.canonicalize().ok();
-        if let (Some(out), Some(scene)) = (whole(&args.out), whole(&args.scene))
+        if let (Ok(out), Ok(scene)) = (args.out.canonicalize(), args.scene.canonicalize())
             && scene.is_dir()
             && out.starts_with(&scene)
         {
@@ -219,24 +217,24 @@ impl Out {
         }
         let inputs = [args.scene.as_path()];
         if is_folder {
-            return WrittenFiles::open(&args.out, args.force, &inputs).map(Out::Folder);
+            return WrittenFiles::open(&args.out, args.force, &inputs).map(Output::Folder);
         }
         match SplatFormat::named(format).filter(|format| format.name != "ply") {
             Some(format) => {
                 check_file(&args.out, args.force, &inputs)?;
-                Ok(Out::Splats(Reserved::open(&args.out, args.force)?, format))
+                Ok(Output::Splats(Reserved::open(&args.out, args.force)?, format))
             }
-            None => WrittenFile::open(&args.out, args.force, &inputs).map(Out::File),
+            None => WrittenFile::open(&args.out, args.force, &inputs).map(Output::File),
         }
     }
 }
 
-/// Names of the formats whose files have an ending, and the endings.
+/// Formats with a file ending: (name, ending).
 fn endings() -> impl Iterator<Item = (&'static str, &'static str)> {
     FORMATS.iter().map(|f| (f.name, f.ending)).chain([("transforms", ".json")])
 }
 
-/// The format that is asked for, else that of the ending of `--out`.
+/// The requested format, or that of the ending of `--out`.
 fn format(args: &ExportArgs) -> Result<&str> {
     if let Some(format) = &args.format {
         return Ok(format);
@@ -252,15 +250,14 @@ fn format(args: &ExportArgs) -> Result<&str> {
     }
 }
 
-/// Refuses a name that is of another format, by which programs would take the file for it; returns
-/// a warning for one of none.
+/// Refuses an ending of another format, and returns a warning for an ending of none.
 fn check_ending(path: &Path, format: &str) -> Result<Option<String>> {
     let Some((_, own)) = endings().find(|(name, _)| *name == format) else { return Ok(None) };
     let (out, file) = (path.display(), path.to_string_lossy());
     let lower = file.to_lowercase();
     match endings().find(|(_, ending)| lower.ends_with(ending)) {
         Some((name, _)) if name == format => Ok(None),
-        // Programs tell a compressed .ply by its content.
+        // Programs recognise a compressed .ply by its content.
         Some(("ply", _)) if format == "compressed-ply" => Ok(None),
         Some((name, ending)) => {
             let stem = file.get(..file.len() - ending.len()).unwrap_or_default();
@@ -273,7 +270,7 @@ fn check_ending(path: &Path, format: &str) -> Result<Option<String>> {
     }
 }
 
-/// Warns where a file of one set of splats gets features that were trained on others.
+/// Warns if a file with one set of splats gets features that were trained on others.
 fn warn_of_models(scene: &Scene) {
     let levels = scene.language.iter().flat_map(|field| &field.levels);
     if levels.into_iter().any(|level| level.splats.is_some()) {
@@ -284,7 +281,7 @@ fn warn_of_models(scene: &Scene) {
     }
 }
 
-/// Drops what no photo shows.
+/// Drops splats that no photo shows.
 fn keep_seen(scene: &mut Scene, args: &ExportArgs) -> Result<()> {
     if scene.seen.pixels.is_empty() {
         return Err(Error::input(format!(
@@ -299,13 +296,13 @@ fn keep_seen(scene: &mut Scene, args: &ExportArgs) -> Result<()> {
     Ok(())
 }
 
-/// Base colours of ordinary photos stay below this: of 145,000 splats of the breakfast scene one in
+/// Upper bound of base colours in ordinary photos: of 145,000 splats of the breakfast scene one in
 /// 50,000 is above 1.1, none above 1.25.
 const ORDINARY: f32 = 1.25;
-/// Share of the solid splats that may be cut off unnoticed.
+/// Share of the solid splats that may be clipped without a warning.
 const UNNOTICED: f64 = 5e-4;
 
-/// Warns of what a format cannot hold.
+/// Warns of properties that a format cannot hold.
 fn warn_of_losses(splats: &Splats, format: &SplatFormat) {
     if let Some(brightest) = format.brightest {
         warn_of_range(splats, brightest);
@@ -319,8 +316,7 @@ fn warn_of_losses(splats: &Splats, format: &SplatFormat) {
     }
 }
 
-/// Warns where a format of bytes cuts off what solid splats have beyond its `brightest` base
-/// colour.
+/// Warns if a format clips base colours of solid splats above `brightest`.
 fn warn_of_range(splats: &Splats, brightest: f32) {
     let row = splats.sh.len() / splats.len().max(1);
     let limit = brightest.max(ORDINARY);

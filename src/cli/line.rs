@@ -1,4 +1,4 @@
-//! Text as it may go to a terminal.
+//! Text that is safe for a terminal.
 pub(super) use crate::report::one_line;
 use crate::report::visible;
 use std::borrow::Cow;
@@ -16,7 +16,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_have_no_control_characters() {
+    fn lines_drop_control_characters() {
         assert_eq!(lines("a\nb"), "a\nb");
         assert_eq!(lines("a\n\u{1b}b"), "a\n\u{fffd}b");
     }

@@ -60,7 +60,7 @@ pub fn measure(args: &MeasureArgs) -> Result<()> {
     print(&table(&all, &measured, scale))
 }
 
-/// Metres with one standard deviation: that of the length, and that of the scale.
+/// Length in metres and its σ, from the σ of the length and of the scale.
 fn in_metres(m: &Measured, scale: &Scale) -> (f64, f64) {
     let metres = m.units * scale.metres_per_unit;
     (metres, metres * (m.sigma / m.units).hypot(scale.log_sigma))

@@ -1,4 +1,4 @@
-//! Command line: [`args`] = arguments, `plan` = the plan that they describe, one file per command.
+//! Command line: arguments in [`args`], one file per command.
 pub mod args;
 mod bench;
 mod clean;
@@ -29,14 +29,13 @@ use args::{Cli, Command, LogFormat};
 use clap::{CommandFactory, FromArgMatches};
 use std::process::ExitCode;
 
-/// A program of commands with one way of parsing, reporting and ending. The laboratory has a
-/// second one.
+/// A program of commands that share parsing, reporting and exit codes. The laboratory has a second
+/// one.
 pub trait Program: CommandFactory + FromArgMatches {
     /// Name of the program.
     const NAME: &'static str;
 
-    /// Options that a command takes because its neighbours do, and does not use: (command,
-    /// options). Its help hides them.
+    /// Options that a command inherits but does not use, hidden in its help: (command, options).
     const UNUSED: &'static [(&'static str, &'static [&'static str])];
 
     /// Format of standard error.
@@ -51,7 +50,7 @@ pub fn main() -> ExitCode {
     start::<Cli>()
 }
 
-/// Runs the command line of this process: one error line at most, and an exit code by the kind of
+/// Runs the command line of this process: at most one error line, and an exit code by the kind of
 /// the error ([`Error::exit_code`]).
 pub fn start<P: Program>() -> ExitCode {
     let program = match usage::parse::<P>() {
@@ -60,7 +59,7 @@ pub fn start<P: Program>() -> ExitCode {
     };
     progress::set_format(P::NAME, program.log());
     progress::stop_on_signal();
-    gpu::on_long_compilation(progress::tell_of_compilation);
+    gpu::on_long_compilation(progress::report_compilation);
     match program.execute() {
         Ok(()) => {
             progress::release();
@@ -116,7 +115,7 @@ impl Program for Cli {
     }
 }
 
-/// Where a command went that is not for users.
+/// Error of a command that moved to splatlab.
 fn moved(command: &str) -> Error {
     Error::input(format!(
         "{command} is a command of splatlab, which nothing installs: in a clone of {}, run `cargo run --release -p splatlab -- {command}`",

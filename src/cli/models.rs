@@ -3,6 +3,7 @@ use super::args::{ModelsAction, ModelsArgs};
 use super::fetch::fetch;
 use super::print::{print, print_json};
 use crate::infer::check::{Measured, check};
+use crate::infer::graph::GraphFile;
 use crate::infer::installed::{CatalogueEntry, Installed, Inventory, catalogue, inventory};
 use crate::infer::{ModelStatus, Registry};
 use crate::{Error, Result};
@@ -43,7 +44,7 @@ fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
         }));
     }
     let mut text = String::from("Built-in pack: what splatvk uses unless told otherwise\n");
-    status.iter().for_each(|m| built_in(&mut text, m));
+    status.iter().for_each(|m| write_built_in(&mut text, m));
     let packs = [
         ("paper", "Paper pack: the networks of the paper (splatvk models fetch paper)"),
         ("open", "Open pack: every licence permits commercial use (splatvk models fetch open)"),
@@ -54,25 +55,24 @@ fn list(registry: &Registry, found: &Inventory, as_json: bool) -> Result<()> {
         let of_pack = |k: &&CatalogueEntry| {
             if pack.is_empty() { k.packs.is_empty() } else { k.packs.iter().any(|p| p == pack) }
         };
-        catalogue().iter().filter(of_pack).for_each(|k| entry(&mut text, k, registry, found));
+        catalogue().iter().filter(of_pack).for_each(|k| write_entry(&mut text, k, registry, found));
     }
     let unlisted: Vec<&Installed> = found.models.iter().filter(|m| m.catalogue_entry().is_none()).collect();
     if !unlisted.is_empty() {
         text.push_str("\nInstalled, not in the catalogue\n");
-        unlisted.iter().for_each(|m| installed(&mut text, m));
+        unlisted.iter().for_each(|m| write_installed(&mut text, m));
     }
     if !found.broken.is_empty() {
         text.push_str("\nNot usable\n");
         found.broken.iter().for_each(|b| {
-            let why = &b.reason;
-            let _ = writeln!(text, "  → {why}");
+            let _ = writeln!(text, "  → {}", b.reason);
         });
     }
     text.push_str("\nsplatvk models list --json also has the checksums\n");
     print(&text)
 }
 
-fn built_in(text: &mut String, m: &ModelStatus) {
+fn write_built_in(text: &mut String, m: &ModelStatus) {
     let kind = format!("{:?}", m.kind).to_lowercase();
     let state = if m.installed { "installed" } else { "MISSING" };
     let size = m.bytes as f64 / 1e6;
@@ -84,25 +84,25 @@ fn built_in(text: &mut String, m: &ModelStatus) {
     }
 }
 
-fn entry(text: &mut String, k: &CatalogueEntry, registry: &Registry, found: &Inventory) {
-    let model = of_entry(k, found);
+fn write_entry(text: &mut String, k: &CatalogueEntry, registry: &Registry, found: &Inventory) {
+    let model = installed_entry(k, found);
     let state = if model.is_some() { "installed" } else { "-" };
     let (task, size) = (k.task.name(), f64::from(k.megabytes));
     let _ =
         writeln!(text, "{task:<10} {:<40} {state:<9} {size:7.1} MB  {:<28} {}", k.name, k.licence, k.source);
     match model {
-        Some(m) => installed(text, m),
+        Some(m) => write_installed(text, m),
         None => {
             let how = match crate::fetch::sources(k).is_empty() {
                 true => k.export.clone(),
                 false => format!("splatvk models fetch {}, or {}", k.id, k.export),
             };
-            let _ = writeln!(text, "{:10} looked for in {}; from {how}", "", place(k, registry));
+            let _ = writeln!(text, "{:10} looked for in {}; from {how}", "", expected_folder(k, registry));
         }
     }
 }
 
-fn installed(text: &mut String, m: &Installed) {
+fn write_installed(text: &mut String, m: &Installed) {
     let tasks: Vec<&str> = m.tasks.iter().map(|d| d.name()).collect();
     let untrained = if m.untrained() { ", UNTRAINED weights" } else { "" };
     let _ = writeln!(text, "{:10} {} in {}: {}{untrained}", "", m.name, m.folder.display(), tasks.join(", "));
@@ -116,22 +116,22 @@ fn installed(text: &mut String, m: &Installed) {
             graph.path.display()
         );
     }
-    unused(text, m);
+    write_unused(text, m);
 }
 
-/// Graphs beside a whole model, such as CLIP's two towers in one file, do no harm but may be what
-/// somebody meant.
-fn unused(text: &mut String, m: &Installed) {
-    for why in &m.unused {
-        let _ = writeln!(text, "{:10}   not used: {why}", "");
+/// Lists graphs beside a complete model, such as CLIP's two towers in one file: harmless, but
+/// possibly meant for use.
+fn write_unused(text: &mut String, m: &Installed) {
+    for reason in &m.unused {
+        let _ = writeln!(text, "{:10}   not used: {reason}", "");
     }
 }
 
-fn of_entry<'f>(k: &CatalogueEntry, found: &'f Inventory) -> Option<&'f Installed> {
+fn installed_entry<'f>(k: &CatalogueEntry, found: &'f Inventory) -> Option<&'f Installed> {
     found.models.iter().find(|m| m.catalogue_entry().is_some_and(|known| known.id == k.id))
 }
 
-fn place(k: &CatalogueEntry, registry: &Registry) -> String {
+fn expected_folder(k: &CatalogueEntry, registry: &Registry) -> String {
     registry.folders().first().map_or(k.id.clone(), |f| f.join(&k.id).display().to_string())
 }
 
@@ -143,7 +143,7 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
     let mut results = Vec::new();
     if !as_json {
         let mut text = String::new();
-        status.iter().for_each(|m| built_in(&mut text, m));
+        status.iter().for_each(|m| write_built_in(&mut text, m));
         if !found.models.is_empty() {
             let _ = writeln!(text, "\nNetworks, computed by provider {}", registry.compute().name()?);
         }
@@ -155,7 +155,7 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
             problems.push(e.to_string());
         }
         if !as_json {
-            print(&checked(model, result.as_deref().ok()))?;
+            print(&check_text(model, result.as_deref().ok()))?;
         }
         results.push(json!({
             "name": model.name, "untrained": model.untrained(), "steps": result.as_ref().ok(),
@@ -175,7 +175,7 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
 }
 
 /// Seconds, memory and error of a model's steps.
-pub fn checked(model: &Installed, steps: Option<&[Measured]>) -> String {
+pub fn check_text(model: &Installed, steps: Option<&[Measured]>) -> String {
     let state = if steps.is_some() { "sound" } else { "NOT USABLE" };
     let untrained = if model.untrained() { " (untrained weights)" } else { "" };
     let mut text = format!("{}{untrained}: {state}\n", model.name);
@@ -184,12 +184,11 @@ pub fn checked(model: &Installed, steps: Option<&[Measured]>) -> String {
         let memory = s.peak_memory as f64 / 1e9;
         let _ = writeln!(text, "  {:<44} {:8.2} s {memory:6.2} GB{error}", s.step, s.seconds);
     }
-    unused(&mut text, model);
+    write_unused(&mut text, model);
     text
 }
 
-/// The JSON of one built-in model, as `models list --json`, `doctor --json` and `run.json` print
-/// it.
+/// JSON of a built-in model for `models list --json`, `doctor --json` and `run.json`.
 pub fn to_json(m: &ModelStatus) -> serde_json::Value {
     json!({
         "role": format!("{:?}", m.kind).to_lowercase(), "name": m.name, "file": m.file, "installed": m.installed,
@@ -202,20 +201,21 @@ fn known_json(k: &CatalogueEntry, registry: &Registry, found: &Inventory) -> ser
     json!({
         "role": k.task, "id": k.id, "name": k.name, "family": k.family, "packs": k.packs, "licence": k.licence,
         "non_commercial": k.non_commercial, "megabytes": k.megabytes, "source": k.source, "export": k.export,
-        "fetchable": !crate::fetch::sources(k).is_empty(), "looked_for": place(k, registry),
-        "installed": of_entry(k, found).is_some(),
+        "fetchable": !crate::fetch::sources(k).is_empty(), "looked_for": expected_folder(k, registry),
+        "installed": installed_entry(k, found).is_some(),
     })
 }
 
 fn installed_json(m: &Installed) -> serde_json::Value {
-    let graph = |g: &crate::infer::graph::GraphFile| {
-        json!({
-            "part": g.binding.part, "file": g.path, "parameters": g.parameters, "bytes": g.bytes(), "opset": g.opset,
-            "sha256": g.pinned.iter().map(|f| json!({ "file": f.path, "pinned": f.sha256 })).collect::<Vec<_>>(),
-        })
-    };
     json!({
         "name": m.name, "family": m.family, "duties": m.tasks, "folder": m.folder, "untrained": m.untrained(), "unused": m.unused,
-        "graphs": m.graphs.values().map(graph).collect::<Vec<_>>(),
+        "graphs": m.graphs.values().map(graph_json).collect::<Vec<_>>(),
+    })
+}
+
+fn graph_json(g: &GraphFile) -> serde_json::Value {
+    json!({
+        "part": g.binding.part, "file": g.path, "parameters": g.parameters, "bytes": g.bytes(), "opset": g.opset,
+        "sha256": g.pinned.iter().map(|f| json!({ "file": f.path, "pinned": f.sha256 })).collect::<Vec<_>>(),
     })
 }

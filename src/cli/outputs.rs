@@ -1,12 +1,11 @@
-//! What a command writes where the user says: by the rule of [`check_place`], and all of it or
-//! none.
+//! Output files of commands: placed by the rule of [`check_place`], complete or not at all.
 use crate::files::{self, Kind, Partial, check_place, check_spared};
 use crate::format::scene_files;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// A file that a command will write, whole or not at all. As long as it is reserved, no other
-/// command writes there.
+/// An output file, written whole or not at all. While it is reserved, no other command writes
+/// there.
 pub struct WrittenFile {
     place: PathBuf,
     force: bool,
@@ -14,8 +13,10 @@ pub struct WrittenFile {
 }
 
 impl WrittenFile {
-    /// Reserves the place before any work. One that may not be written, or that is one of the
-    /// `inputs`, is bad input.
+    /// Reserves the place before any work.
+    ///
+    /// # Errors
+    /// Bad input for a place that may not be written or is one of the `inputs`.
     pub fn open(place: &Path, force: bool, inputs: &[&Path]) -> Result<WrittenFile> {
         check_file(place, force, inputs)?;
         Ok(WrittenFile { place: place.to_path_buf(), force, partial: Partial::beside(place)? })
@@ -25,7 +26,7 @@ impl WrittenFile {
     pub fn keep(self, write: impl FnOnce(&Path) -> Result<()>) -> Result<()> {
         let WrittenFile { place, force, partial } = self;
         write(partial.path())?;
-        // What came there while it was written is not ours.
+        // A file that appeared meanwhile is not overwritten.
         check_place(&place, Kind::File, force)?;
         partial.finish(|path| std::fs::rename(path, &place).map_err(Error::unwritable(&place)))
     }
@@ -40,28 +41,30 @@ pub fn check_file(place: &Path, force: bool, inputs: &[&Path]) -> Result<()> {
     check_spared(place, inputs.iter().copied())
 }
 
-/// Files of a command that writes into a folder. They are written into a hidden folder, beside one
-/// that is to be made, else in it; dropped without [`WrittenFiles::keep`], it vanishes with all
-/// that is in it.
+/// Output files of a command in a folder. They are written into a hidden folder, beside a new
+/// folder or inside an existing one; dropped without [`WrittenFiles::keep`], it is removed with its
+/// content.
 pub struct WrittenFiles {
     folder: PathBuf,
     force: bool,
     partial: Partial,
-    /// What the command reads, whole paths.
+    /// Inputs of the command, canonical paths.
     inputs: Vec<PathBuf>,
     names: Vec<PathBuf>,
-    /// Files of the folder that go once those are there.
+    /// Existing files that are removed after the new ones are in place.
     outdated: Vec<PathBuf>,
 }
 
 impl WrittenFiles {
-    /// Reserves a folder, creating it where needed; with `force` it may have files already, but of
-    /// the `inputs` none is replaced. A place that cannot be written, or that another command
-    /// writes to, is bad input.
+    /// Reserves a folder, creating it where needed; with `force` it may contain files, but no
+    /// `inputs` are replaced.
+    ///
+    /// # Errors
+    /// Bad input for a place that cannot be written, or that another command writes to.
     pub fn open(folder: &Path, force: bool, inputs: &[&Path]) -> Result<WrittenFiles> {
         check_place(folder, Kind::Folder, force)?;
         let partial = if folder.exists() {
-            // It may be about to be replaced as a whole.
+            // Another command may be replacing the folder as a whole.
             files::check_free(folder)?;
             Partial::inside(folder)?
         } else {
@@ -73,18 +76,18 @@ impl WrittenFiles {
         Ok(WrittenFiles { folder: folder.to_path_buf(), force, partial, inputs, names, outdated })
     }
 
-    /// Files of these names say the same in another form: what the folder has of them would
-    /// contradict what is written.
+    /// Marks files for removal that hold the same data in another form and would contradict the new
+    /// ones.
     pub fn outdate<'a>(&mut self, names: impl Iterator<Item = &'a str>) {
         self.outdated.extend(names.map(PathBuf::from));
     }
 
-    /// The hidden folder, for what writes several files itself: [`WrittenFiles::keep`] finds them.
+    /// The hidden folder, for writers of several files: [`WrittenFiles::keep`] finds them.
     pub fn folder(&self) -> &Path {
         self.partial.path()
     }
 
-    /// Where to write `name`, which may have folders of its own.
+    /// Path to write `name` to, which may contain folders.
     pub fn file(&mut self, name: &str) -> Result<PathBuf> {
         let path = self.partial.path().join(name);
         if let Some(parent) = path.parent() {
@@ -94,17 +97,17 @@ impl WrittenFiles {
         Ok(path)
     }
 
-    /// Everything is written: moves the files to their places, over ordinary files of their names
-    /// only, and returns them; those of [`WrittenFiles::file`] first, in their order.
+    /// Moves the written files to their places, over ordinary files of their names only, and
+    /// returns their paths: those of [`WrittenFiles::file`] first, in their order.
     pub fn keep(self) -> Result<Vec<PathBuf>> {
         let WrittenFiles { folder, force, partial, inputs, mut names, outdated } = self;
         let mut found = Vec::new();
-        list(partial.path(), Path::new(""), &mut found)?;
+        collect_files(partial.path(), Path::new(""), &mut found)?;
         found.retain(|name| !names.contains(name));
         found.sort();
         names.extend(found);
-        // Everything that may be refused comes before the first file is moved. What came there
-        // meanwhile is not ours.
+        // All refusals come before the first move. Files that appeared meanwhile are not
+        // overwritten.
         check_ours(&folder, force)?;
         for name in &names {
             for part in name.ancestors().skip(1).filter(|p| !p.as_os_str().is_empty()) {
@@ -118,7 +121,7 @@ impl WrittenFiles {
         outdated.iter().try_for_each(|place| check_place(place, Kind::File, true))?;
         let places: Vec<PathBuf> = names.iter().map(|name| folder.join(name)).collect();
         partial.finish(|from| {
-            // In one step, so that a process that is killed here leaves all or nothing.
+            // One rename, so that a killed process leaves all or nothing.
             if !folder.exists() {
                 return std::fs::rename(from, &folder).map_err(Error::unwritable(&folder));
             }
@@ -134,11 +137,11 @@ impl WrittenFiles {
     }
 }
 
-/// Refuses a folder that without `force` is to be empty but for what is being written.
+/// Refuses, without `force`, a folder with other files than the hidden ones of this program.
 fn check_ours(folder: &Path, force: bool) -> Result<()> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path());
-    let hidden = |p: &PathBuf| p.as_os_str().as_encoded_bytes().ends_with(files::HIDDEN.as_bytes());
-    match entries.filter(|p| !hidden(p)).min() {
+    let is_hidden = |p: &PathBuf| p.as_os_str().as_encoded_bytes().ends_with(files::HIDDEN.as_bytes());
+    match entries.filter(|p| !is_hidden(p)).min() {
         Some(other) if !force => Err(Error::input(format!(
             "{}: came there while this command worked; choose another folder, or --force to replace files of the same names",
             other.display()
@@ -147,12 +150,12 @@ fn check_ours(folder: &Path, force: bool) -> Result<()> {
     }
 }
 
-/// Refuses to replace a file that is read: an input itself, one of a scene's own, or one of a
-/// folder of inputs into which the command writes.
+/// Refuses to replace an input: a given file, a file of a given scene, or a file of a given folder
+/// that the command writes into.
 fn check_unread(folder: &Path, place: &Path, inputs: &[PathBuf]) -> Result<()> {
     let (Ok(whole), Ok(folder)) = (place.canonicalize(), folder.canonicalize()) else { return Ok(()) };
-    let read = |input: &PathBuf| *input == whole || *input == folder || scene_files::is_own(input, &whole);
-    match inputs.iter().any(read) {
+    let reads = |input: &PathBuf| *input == whole || *input == folder || scene_files::is_own(input, &whole);
+    match inputs.iter().any(reads) {
         true => Err(Error::input(format!(
             "{}: is there already, among what this command reads, and stays; choose another --out",
             place.display()
@@ -161,14 +164,14 @@ fn check_unread(folder: &Path, place: &Path, inputs: &[PathBuf]) -> Result<()> {
     }
 }
 
-/// The files below a folder of `root`, relative to `root`.
-fn list(root: &Path, below: &Path, found: &mut Vec<PathBuf>) -> Result<()> {
+/// Collects the files below `below`, relative to `root`.
+fn collect_files(root: &Path, below: &Path, found: &mut Vec<PathBuf>) -> Result<()> {
     let folder = root.join(below);
     for entry in std::fs::read_dir(&folder).map_err(Error::io(&folder))? {
         let entry = entry.map_err(Error::io(&folder))?;
         let name = below.join(entry.file_name());
         match entry.path().is_dir() {
-            true => list(root, &name, found)?,
+            true => collect_files(root, &name, found)?,
             false => found.push(name),
         }
     }
@@ -186,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn all_or_nothing() {
+    fn written_files_are_all_or_nothing() {
         let base = tempfile::tempdir().unwrap();
         let out = base.path().join("a/b");
         let mut o = WrittenFiles::open(&out, false, &[]).unwrap();
@@ -210,7 +213,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn links_in_the_folder_are_not_followed() {
+    fn written_files_do_not_follow_links() {
         let base = tempfile::tempdir().unwrap();
         let (out, precious) = (base.path().join("out"), base.path().join("precious"));
         std::fs::create_dir_all(&out).unwrap();
@@ -230,33 +233,35 @@ mod tests {
     }
 
     #[test]
-    fn second_writer_and_read_files_are_refused() {
+    fn outputs_refuse_second_writer_and_inputs() {
         let base = tempfile::tempdir().unwrap();
-        let at = |name: &str| base.path().join(name);
-        for out in [at("new"), base.path().to_path_buf()] {
+        let path = |name: &str| base.path().join(name);
+        for out in [path("new"), base.path().to_path_buf()] {
             let first = WrittenFiles::open(&out, true, &[]).unwrap();
             assert!(
                 refused(WrittenFiles::open(&out, true, &[])).contains("another splatvk is writing there")
             );
             drop(first);
         }
-        // Another program wrote there meanwhile.
-        let mut o = WrittenFiles::open(&at("new"), false, &[]).unwrap();
+        // Another program creates the folder meanwhile.
+        let mut o = WrittenFiles::open(&path("new"), false, &[]).unwrap();
         std::fs::write(o.file("a.png").unwrap(), "1").unwrap();
-        std::fs::create_dir(at("new")).unwrap();
-        std::fs::write(at("new/a.png"), "precious").unwrap();
+        std::fs::create_dir(path("new")).unwrap();
+        std::fs::write(path("new/a.png"), "precious").unwrap();
         assert!(refused(o.keep()).contains("while this command worked"));
-        for input in [at("new"), at("new/a.png")] {
-            let mut o = WrittenFiles::open(&at("new"), true, &[&input]).unwrap();
+        for input in [path("new"), path("new/a.png")] {
+            let mut o = WrittenFiles::open(&path("new"), true, &[&input]).unwrap();
             std::fs::write(o.file("a.png").unwrap(), "1").unwrap();
             assert!(refused(o.keep()).contains("what this command reads"));
         }
-        assert_eq!(std::fs::read_to_string(at("new/a.png")).unwrap(), "precious");
-        assert!(refused(WrittenFile::open(&at("new/a.png"), true, &[&at("new/a.png")])).contains("is read"));
-        let first = WrittenFile::open(&at("new/a.png"), true, &[]).unwrap();
-        assert!(refused(WrittenFile::open(&at("new/a.png"), true, &[])).contains("another splatvk"));
+        assert_eq!(std::fs::read_to_string(path("new/a.png")).unwrap(), "precious");
+        assert!(
+            refused(WrittenFile::open(&path("new/a.png"), true, &[&path("new/a.png")])).contains("is read")
+        );
+        let first = WrittenFile::open(&path("new/a.png"), true, &[]).unwrap();
+        assert!(refused(WrittenFile::open(&path("new/a.png"), true, &[])).contains("another splatvk"));
         first.keep(|file| std::fs::write(file, "2").map_err(Error::io(file))).unwrap();
-        assert_eq!(std::fs::read_to_string(at("new/a.png")).unwrap(), "2");
-        assert_eq!(std::fs::read_dir(at("new")).unwrap().count(), 1);
+        assert_eq!(std::fs::read_to_string(path("new/a.png")).unwrap(), "2");
+        assert_eq!(std::fs::read_dir(path("new")).unwrap().count(), 1);
     }
 }

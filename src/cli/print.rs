@@ -1,4 +1,4 @@
-//! What goes to standard output.
+//! Standard output.
 use super::line::lines;
 use crate::{Error, Result};
 use std::io::Write;
@@ -20,18 +20,17 @@ fn put(text: &str) -> Result<()> {
 
 /// Prints one JSON object on a line of its own.
 pub fn print_json(value: &serde_json::Value) -> Result<()> {
-    // As it is: JSON escapes control characters itself, and names must stay what they are.
+    // Unfiltered: JSON escapes control characters itself, and names must stay exact.
     put(&format!("{value}\n"))
 }
 
-/// The lines that one copies after a scene was made: where its report is, and the command that
-/// shows it.
+/// Lines after a scene was made, to copy: path of its report, and the command that shows it.
 pub fn ending(scene: &Path) -> String {
     let report = scene.join("report.html");
     format!("report: {}\nlook at it: splatvk view {}\n", report.display(), quoted(scene))
 }
 
-/// A path as a shell takes it.
+/// A path in the quotes of a shell.
 fn quoted(path: &Path) -> String {
     let text = path.display().to_string();
     let plain = |c: char| c.is_alphanumeric() || "/._-+,:@%".contains(c);
@@ -51,7 +50,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_copied_suits_a_shell() {
+    fn ending_quotes_paths_for_shell() {
         assert_eq!(
             ending(Path::new("out/tree")),
             "report: out/tree/report.html\nlook at it: splatvk view out/tree\n"

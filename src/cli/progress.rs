@@ -12,20 +12,19 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{LazyLock, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
-/// Set by the first Ctrl-C of the process; work notices it between steps.
+/// Set by the first Ctrl-C; work checks it between steps.
 static STOPPED: AtomicBool = AtomicBool::new(false);
 
-/// What this process writes to standard error, and when it began to.
+/// Whether standard error carries JSON, and the start of its clock.
 static JSON: AtomicBool = AtomicBool::new(false);
-static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
+static STARTED: LazyLock<Instant> = LazyLock::new(Instant::now);
 
 /// Name of the program, before its errors.
 static NAME: OnceLock<&'static str> = OnceLock::new();
 
-/// Chooses the format of everything that goes to standard error from now on, and the name before
-/// errors.
+/// Sets the format of standard error, and the program name before errors.
 pub fn set_format(name: &'static str, format: LogFormat) {
-    LazyLock::force(&BEGAN);
+    LazyLock::force(&STARTED);
     NAME.get_or_init(|| name);
     JSON.store(format == LogFormat::Json, Ordering::SeqCst);
 }
@@ -34,22 +33,22 @@ fn as_json() -> bool {
     JSON.load(Ordering::SeqCst)
 }
 
-/// Where the commands of this process report to.
+/// Progress reporter of the commands.
 pub fn reporter() -> Box<dyn Progress> {
     if as_json() { Box::new(JsonLines::default()) } else { Box::new(Terminal::default()) }
 }
 
-/// True once the user wants the process to stop.
+/// Whether the user requested a stop.
 pub fn stopped() -> bool {
     STOPPED.load(Ordering::SeqCst)
 }
 
-/// The error that ends the process; of two threads that end it the first has its say. Input that
-/// cannot be used gets this one line: what was said in the first [`HELD_FOR`] is about work that
-/// nobody will see.
+/// Prints the error that ends the process; of two threads that end it the first wins. Unusable
+/// input (exit code 2) drops the lines held in the first [`HELD_FOR`]: they concern work without a
+/// result.
 pub fn print_error(message: &str, exit_code: u8) {
-    static SAID: AtomicBool = AtomicBool::new(false);
-    if SAID.swap(true, Ordering::SeqCst) {
+    static PRINTED: AtomicBool = AtomicBool::new(false);
+    if PRINTED.swap(true, Ordering::SeqCst) {
         return;
     }
     match exit_code {
@@ -71,33 +70,33 @@ pub fn print_warning(message: &str) {
     }
 }
 
-/// How long after the start of the process lines wait for the end of the checks. Photos that do not
-/// overlap are refused last, after their features: within 4 s for two of 640 × 480 pixels on two
-/// cores.
+/// Time from the start of the process during which lines wait for the end of the checks. Photos
+/// without overlap are refused last, after their features: within 4 s for two of 640 × 480 pixels
+/// on two cores.
 const HELD_FOR: Duration = Duration::from_secs(10);
-/// Lines that wait; `None` once they do not any more.
+/// Waiting lines; `None` after [`release`].
 static HELD: Mutex<Option<Vec<String>>> = Mutex::new(Some(Vec::new()));
 
-/// Prints a line, not before it is known that the input can be used.
+/// Prints a line, or holds it until the input is known to be usable.
 fn print_held(line: &str) {
     let mut held = lock(&HELD);
     let Some(lines) = held.as_mut() else { return write_line(line) };
     if lines.is_empty() {
         std::thread::spawn(|| {
-            std::thread::sleep(HELD_FOR.saturating_sub(BEGAN.elapsed()));
+            std::thread::sleep(HELD_FOR.saturating_sub(STARTED.elapsed()));
             release();
         });
     }
     lines.push(line.to_owned());
 }
 
-/// Prints what was held back; from now on nothing is.
+/// Prints the held lines; later lines are no longer held.
 pub fn release() {
     lock(&HELD).take().into_iter().flatten().for_each(|line| write_line(&line));
 }
 
-/// What to wait for while nothing moves.
-pub fn tell_of_compilation(device: &str) {
+/// Explains a wait for the shader compiler of the driver.
+pub fn report_compilation(device: &str) {
     let message =
         format!("the driver of {} compiles shaders; it takes long only in the first run", one_line(device));
     match as_json() {
@@ -106,14 +105,14 @@ pub fn tell_of_compilation(device: &str) {
     }
 }
 
-/// Writes `{"event", "time", …}` as one line; `time` is in seconds since the process began.
+/// Writes `{"event", "time", …}` as one line; `time` is in seconds since the start of the process.
 fn write_event(event: &str, mut fields: Value) {
     fields["event"] = event.into();
-    fields["time"] = ((BEGAN.elapsed().as_secs_f64() * 1e3).round() / 1e3).into();
+    fields["time"] = ((STARTED.elapsed().as_secs_f64() * 1e3).round() / 1e3).into();
     write_line(&fields.to_string());
 }
 
-/// There is nothing to do when standard error is closed, as it is once the terminal is.
+/// Errors are ignored: standard error may be closed together with the terminal.
 fn write_line(line: &str) {
     let _ = writeln!(std::io::stderr().lock(), "{line}");
 }
@@ -160,24 +159,24 @@ impl Progress for JsonLines {
     }
 }
 
-/// How long after a request to stop the work may go on to its next check. Nothing that is asked of
-/// a network or a driver can be cut short, and some of it takes longer than anyone waits. A process
-/// is to be done after 2 s; its end takes the kernel of a busy machine some time, too.
+/// Time from a request to stop until the process ends regardless of its work. Calls of a network or
+/// a driver cannot be interrupted, and some take longer than a user waits. The process is to end
+/// within 2 s; on a busy machine the kernel needs part of them.
 const GRACE: Duration = Duration::from_millis(1000);
 
-/// Makes Ctrl-C, a termination signal and a closed terminal ask for a clean stop. A second one, and
-/// [`GRACE`], end the process at once; what is unfinished is removed in either case.
+/// Makes Ctrl-C, a termination signal and a closed terminal request a clean stop. A second one, or
+/// [`GRACE`], ends the process at once; unfinished files are removed in either case.
 pub fn stop_on_signal() {
     let outcome = ctrlc::set_handler(|| {
         if STOPPED.swap(true, Ordering::SeqCst) {
-            end();
+            exit_stopped();
         }
         if !as_json() {
             write_line("stopping; press Ctrl-C again to end at once");
         }
         std::thread::spawn(|| {
             std::thread::sleep(GRACE);
-            end();
+            exit_stopped();
         });
     });
     if let Err(error) = outcome {
@@ -185,16 +184,16 @@ pub fn stop_on_signal() {
     }
 }
 
-/// Whether the process does what only ends by being stopped.
+/// Whether the process serves until it is stopped.
 static SERVES: AtomicBool = AtomicBool::new(false);
 
-/// From now on a stop ends the process with 0 and without a word.
-pub fn stopping_is_no_failure() {
+/// From now on a stop ends the process with exit code 0 and without a message.
+pub fn stop_without_error() {
     SERVES.store(true, Ordering::SeqCst);
 }
 
-/// Ends the process as [`Error::Cancelled`] does, whatever its threads are doing.
-fn end() -> ! {
+/// Ends the process as [`Error::Cancelled`] does, regardless of its threads.
+fn exit_stopped() -> ! {
     let nothing = crate::files::remove_unfinished();
     let kept = "stopped; what was finished is kept".to_owned();
     let serves = SERVES.load(Ordering::SeqCst);
@@ -202,9 +201,9 @@ fn end() -> ! {
     if !serves {
         print_error(&if nothing { Error::Cancelled.to_string() } else { kept }, code);
     }
-    // Exit handlers would take apart the libraries that those threads are in.
+    // Exit handlers would unload libraries that threads are running in.
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
-    // SAFETY: ends the process; nothing of it is used afterwards.
+    // SAFETY: ends the process; no state is used afterwards.
     unsafe {
         libc::_exit(code.into())
     }
@@ -214,7 +213,7 @@ fn end() -> ! {
 
 type Stage = (&'static str, Instant, ProgressBar);
 
-/// All bars of the process, below each other; `None` where standard error is no terminal.
+/// All bars of the process; `None` if standard error is no terminal.
 static BARS: LazyLock<Option<MultiProgress>> =
     LazyLock::new(|| std::io::stderr().is_terminal().then(MultiProgress::new));
 
@@ -226,15 +225,14 @@ fn print(line: &str) {
     }
 }
 
-/// The time left, once a step says how long one takes: before, the bar knows none.
+/// Writes the remaining time; nothing before the first step.
 fn time_left(state: &ProgressState, text: &mut dyn std::fmt::Write) {
     if state.pos() > 0 {
         let _ = write!(text, "{:#} left", HumanDuration(state.eta()));
     }
 }
 
-/// The command line's [`Progress`] for people: bars when standard error is a terminal, lines
-/// otherwise.
+/// [`Progress`] for people: bars if standard error is a terminal, else lines.
 #[derive(Default)]
 struct Terminal {
     current: Mutex<Option<Stage>>,

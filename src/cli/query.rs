@@ -27,7 +27,7 @@ use std::fmt::Write;
 use std::path::Path;
 use std::time::Instant;
 
-/// Cameras whose frames are kept at a time.
+/// Cameras whose frames are kept together.
 const AT_ONCE: usize = 16;
 
 pub fn query(args: &QueryArgs) -> Result<()> {
@@ -74,44 +74,45 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let options = Compat::answers(args.compat.as_deref(), &args.scene)?;
     let progress = progress::reporter();
     progress.begin("query", cameras.len() as u64);
-    let mut asked: Vec<Asked> = args.texts.iter().map(|_| Asked::default()).collect();
+    let mut all: Vec<TextAnswers> = args.texts.iter().map(|_| TextAnswers::default()).collect();
     for (part, (cameras, stems)) in cameras.chunks(AT_ONCE).zip(stems.chunks(AT_ONCE)).enumerate() {
         progress.check()?;
         ready.set_views(cameras)?;
-        for ((text, folder), asked) in args.texts.iter().zip(&folders).zip(&mut asked) {
+        for ((text, folder), joined) in args.texts.iter().zip(&folders).zip(&mut all) {
             let clock = Instant::now();
             let answers = ready.ask(text, &options)?;
-            let before = asked.views.len();
-            asked.milliseconds += 1e3 * clock.elapsed().as_secs_f64();
+            let before = joined.views.len();
+            joined.milliseconds += 1e3 * clock.elapsed().as_secs_f64();
             for (((frame, stem), camera), answer) in
                 ready.frames().iter().zip(stems).zip(cameras).zip(&answers.views)
             {
-                let place = place(frame, camera, answer, &scene.world);
+                let place = place_json(frame, camera, answer, &scene.world);
                 let mut view = to_json(stem, answer, &place);
                 if let Some(out) = &mut out {
                     write(out, stem, folder, &frame.rendered.rgb, answer, &mut view)?;
                 }
-                view["reliability"] = answers.view_reliability[asked.views.len() - before].into();
-                asked.views.push(view);
+                view["reliability"] = answers.view_reliability[joined.views.len() - before].into();
+                joined.views.push(view);
             }
-            asked.join(answers);
+            joined.join(answers);
         }
         progress.step((part * AT_ONCE + cameras.len()) as u64, "");
     }
     progress.end();
     let mut queries = Vec::new();
-    for (asked, folder) in asked.iter().zip(&folders) {
-        let Some(answers) = &asked.answers else { continue };
+    for (joined, folder) in all.iter().zip(&folders) {
+        let Some(answers) = &joined.answers else { continue };
         let mut entry = answers.record(&stems, &scene.world);
-        (entry["milliseconds"], entry["views"]) = (asked.milliseconds.into(), asked.views.clone().into());
+        (entry["milliseconds"], entry["views"]) = (joined.milliseconds.into(), joined.views.clone().into());
         entry["embedded_by"] = json!(ready.encoder().embedding_source(&answers.text));
         if let Some(out) = out.as_mut().filter(|_| args.splats) {
-            let (chosen, name) = (&answers.selection, format!("{folder}/splats.ply"));
-            let carrier = ready.field().levels[chosen.level].carrier(&scene.splats);
-            let splats = carrier.picked(&chosen.splats);
+            let (selection, name) = (&answers.selection, format!("{folder}/splats.ply"));
+            let carrier = ready.field().levels[selection.level].carrier(&scene.splats);
+            let splats = carrier.picked(&selection.splats);
             ply::write_splats(&out.file(&name)?, &splats, PlyOptions::default())?;
             entry["splats"] = json!({
-                "count": chosen.splats.len(), "level": LEVEL_NAMES[chosen.level], "found": chosen.found, "file": name,
+                "count": selection.splats.len(), "level": LEVEL_NAMES[selection.level], "found": selection.found,
+                "file": name,
             });
         }
         queries.push(entry);
@@ -124,22 +125,22 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     }
     match (args.device.json, &args.out) {
         (true, _) => print_json(&report),
-        (false, Some(folder)) => print(&table(&asked, &stems, folder)),
-        (false, None) => print(&short_table(&asked)),
+        (false, Some(folder)) => print(&table(&all, &stems, folder)),
+        (false, None) => print(&short_table(&all)),
     }
 }
 
-/// One text, asked of all cameras part by part.
+/// Answers to one text, over all cameras in parts.
 #[derive(Default)]
-struct Asked {
-    /// Its views are in `views`.
+struct TextAnswers {
+    /// Answers without their `views`, which are in the next field.
     answers: Option<Answers>,
     views: Vec<Value>,
     milliseconds: f64,
 }
 
-impl Asked {
-    /// Adds the answer for more cameras: only what views show differs.
+impl TextAnswers {
+    /// Adds the answer for more cameras; only the per-view parts differ.
     fn join(&mut self, mut part: Answers) {
         part.views.clear();
         match &mut self.answers {
@@ -152,7 +153,7 @@ impl Asked {
     }
 }
 
-/// Writes the files of an answer in a view, and names them in its record.
+/// Writes the files of an answer in a view, and records their names.
 fn write(
     out: &mut WrittenFiles,
     stem: &str,
@@ -172,17 +173,18 @@ fn write(
     picture::write_npy(&out.file(&name("relevancy.npy"))?, size, None, &a.relevancy.data)
 }
 
-/// Where the location is in space, and how far from the camera; null where the scene shows nothing.
-fn place(frame: &DecodedFrame, camera: &Camera, a: &QueryResult, world: &World) -> Value {
+/// Position of the answer in space and its distance from the camera; null if the scene shows
+/// nothing.
+fn place_json(frame: &DecodedFrame, camera: &Camera, a: &QueryResult, world: &World) -> Value {
     let (x, y) = a.location;
     let depth = f64::from(frame.rendered.depth.at(x, y));
     if depth <= 0.0 {
         return Value::Null;
     }
-    let at = camera.unproject(DVec2::new(x as f64 + 0.5, y as f64 + 0.5), depth);
-    let distance = at.distance(camera.pose.centre());
+    let position = camera.unproject(DVec2::new(x as f64 + 0.5, y as f64 + 0.5), depth);
+    let distance = position.distance(camera.pose.centre());
     let metres = world.scale.as_ref().map(|s| distance * s.metres_per_unit);
-    json!({ "position": at.to_array(), "distance": distance, "distance_metres": metres })
+    json!({ "position": position.to_array(), "distance": distance, "distance_metres": metres })
 }
 
 fn to_json(stem: &str, a: &QueryResult, place: &Value) -> Value {
@@ -195,18 +197,18 @@ fn to_json(stem: &str, a: &QueryResult, place: &Value) -> Value {
     })
 }
 
-/// A row per text: whether it is there, how sure that is, where, and the view that shows it best.
-fn short_table(asked: &[Asked]) -> String {
+/// A row per text: presence, p-value, position, and the best view.
+fn short_table(texts: &[TextAnswers]) -> String {
     let mut rows = vec![["text", "answer", "p", "place (x, y, z)", "best view"].map(str::to_owned)];
     let mut notes = Vec::new();
-    for asked in asked {
-        let Some(answers) = &asked.answers else { continue };
+    for TextAnswers { answers, views, .. } in texts {
+        let Some(answers) = answers else { continue };
         let text = format!("“{}”", one_line(&answers.text));
         notes.extend(answers.reading.notes().iter().map(|note| format!("{text}: {}\n", one_line(note))));
         let place = answers.instances.first().map(|i| i.centre.to_array().map(|v| format!("{v:.3}")));
         let absent = answers.presence == Some(Presence::Absent);
         let score = |v: &&Value| v["score"].as_f64().unwrap_or(0.0);
-        let best = asked.views.iter().filter(|v| v["found"] == true);
+        let best = views.iter().filter(|v| v["found"] == true);
         let best = best.max_by(|a, b| score(a).total_cmp(&score(b))).filter(|_| !absent);
         rows.push([
             text,
@@ -226,30 +228,30 @@ fn short_table(asked: &[Asked]) -> String {
     columns(&rows) + &notes.concat()
 }
 
-/// Rows with their cells below each other.
+/// Aligns cells in columns.
 fn columns(rows: &[[String; 5]]) -> String {
-    let wide = |column: usize| rows.iter().map(|r| r[column].chars().count()).max().unwrap_or(0);
+    let width_of = |column: usize| rows.iter().map(|r| r[column].chars().count()).max().unwrap_or(0);
     let mut text = String::new();
     for row in rows {
-        let cells = row.iter().enumerate().map(|(k, cell)| format!("{cell:<wide$}", wide = wide(k)));
+        let cells = row.iter().enumerate().map(|(k, cell)| format!("{cell:<width$}", width = width_of(k)));
         text += cells.collect::<Vec<_>>().join("  ").trim_end();
         text.push('\n');
     }
     text
 }
 
-/// What stands in the folder of the answers.
-fn table(asked: &[Asked], stems: &[String], folder: &Path) -> String {
+/// Results of all views, with the folder of their files.
+fn table(texts: &[TextAnswers], stems: &[String], folder: &Path) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.
-    for asked in asked {
-        let Some(answers) = &asked.answers else { continue };
-        let found = asked.views.iter().filter(|v| v["found"] == true).count();
-        let verdict = answer::verdict(answers.presence, found, asked.views.len());
+    for TextAnswers { answers, views, milliseconds } in texts {
+        let Some(answers) = answers else { continue };
+        let found = views.iter().filter(|v| v["found"] == true).count();
+        let verdict = answer::verdict(answers.presence, found, views.len());
         let notes: String = answers.reading.notes().iter().map(|note| format!("; {note}")).collect();
-        let asked_for = one_line(&format!("“{}”: {verdict}{notes}", answers.text));
-        let _ = writeln!(text, "{asked_for}; answered in {:.0} ms", asked.milliseconds);
-        for v in &asked.views {
+        let summary = one_line(&format!("“{}”: {verdict}{notes}", answers.text));
+        let _ = writeln!(text, "{summary}; answered in {milliseconds:.0} ms");
+        for v in views {
             let verdict = if v["found"] == true { "" } else { "  not found" };
             let _ = writeln!(
                 text,
@@ -269,13 +271,13 @@ fn table(asked: &[Asked], stems: &[String], folder: &Path) -> String {
     text
 }
 
-/// Where one of the things is: in space, and in the first view that shows it.
+/// Position of an instance in space, and in the first view that shows it.
 fn instance_line(n: usize, instance: &Instance, stems: &[String]) -> String {
     let ([x, y, z], [a, b, c]) = (instance.centre.to_array(), instance.oriented.size.to_array());
-    let seen = stems.iter().zip(&instance.pixels).find_map(|(stem, p)| Some((stem, (*p)?)));
-    let seen = seen.map_or(String::new(), |(stem, [x, y])| format!(", pixel {x:.0}, {y:.0} of view {stem}"));
+    let view = stems.iter().zip(&instance.pixels).find_map(|(stem, p)| Some((stem, (*p)?)));
+    let view = view.map_or(String::new(), |(stem, [x, y])| format!(", pixel {x:.0}, {y:.0} of view {stem}"));
     let splats = instance.splats.len();
-    format!("  {n}. at {x:.3}, {y:.3}, {z:.3}, size {a:.3} × {b:.3} × {c:.3}, {splats} splats{seen}")
+    format!("  {n}. at {x:.3}, {y:.3}, {z:.3}, size {a:.3} × {b:.3} × {c:.3}, {splats} splats{view}")
 }
 
 #[cfg(test)]
@@ -285,19 +287,18 @@ mod tests {
     use crate::scene::{Pose, Scale};
 
     #[test]
-    fn the_distance_to_an_answer_is_told_in_units_and_in_metres() {
+    fn place_json_states_units_and_metres() {
         let mut rendered = RenderedFrame::empty(4, 4, 0);
         rendered.depth.data.fill(4.0);
         let frame = DecodedFrame { rendered, codes: Vec::new() };
         let (pose, size) = (Pose::IDENTITY, 4);
         let camera =
             Camera { name: "a".into(), width: size, height: size, fx: 4.0, fy: 4.0, cx: 0.5, cy: 1.5, pose };
-        // The middle of pixel (3, 1) is 3 pixels right of the principal point: 3 units at a depth
-        // of 4.
+        // The centre of pixel (3, 1) is 3 pixels right of the principal point: 3 units at depth 4.
         let answer = QueryResult { location: (3, 1), ..QueryResult::default() };
         let scale = Scale { metres_per_unit: 0.25, log_sigma: 0.1, stated: Vec::new() };
-        let told = place(&frame, &camera, &answer, &World { scale: Some(scale), ..World::default() });
-        assert_eq!((told["distance"].as_f64(), told["distance_metres"].as_f64()), (Some(5.0), Some(1.25)));
-        assert_eq!(place(&frame, &camera, &answer, &World::default())["distance_metres"], Value::Null);
+        let place = place_json(&frame, &camera, &answer, &World { scale: Some(scale), ..World::default() });
+        assert_eq!((place["distance"].as_f64(), place["distance_metres"].as_f64()), (Some(5.0), Some(1.25)));
+        assert_eq!(place_json(&frame, &camera, &answer, &World::default())["distance_metres"], Value::Null);
     }
 }

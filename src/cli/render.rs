@@ -33,8 +33,8 @@ pub fn render(args: &RenderArgs) -> Result<()> {
             args.scene.display()
         )));
     }
-    let nothing = LanguageField::default();
-    let field = if wants_language { scene.language.as_ref().unwrap_or(&nothing) } else { &nothing };
+    let no_language = LanguageField::default();
+    let field = if wants_language { scene.language.as_ref().unwrap_or(&no_language) } else { &no_language };
     let device = gpu::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
     let mut unseen =
@@ -63,11 +63,11 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     listing(&out.keep()?, args.device.json)
 }
 
-/// What is written of one camera.
+/// Output of one camera.
 #[derive(Clone, Copy)]
 struct View<'a> {
     decoded: &'a DecodedFrame,
-    /// [H, W] share that no photo shows, where it is asked for.
+    /// [H, W] share of unseen splats, if requested.
     unseen: Option<&'a Image<f32>>,
 }
 
@@ -75,21 +75,22 @@ struct View<'a> {
 fn levels(field: &LanguageField) -> Vec<(&'static str, usize, usize, usize)> {
     let mut first = 0;
     let mut out = Vec::new();
-    for (at, (name, level)) in LEVEL_NAMES.into_iter().zip(&field.levels).enumerate() {
+    for (index, (name, level)) in LEVEL_NAMES.into_iter().zip(&field.levels).enumerate() {
         if !level.codebook.is_empty() {
-            out.push((name, first, level.codebook.code_dim, at));
+            out.push((name, first, level.codebook.code_dim, index));
             first += level.codebook.code_dim;
         }
     }
     out
 }
 
-fn part(view: &DecodedFrame, first: usize, d: usize) -> Vec<f32> {
+/// Features of one level, [H, W, d].
+fn level_features(view: &DecodedFrame, first: usize, d: usize) -> Vec<f32> {
     let pixels = view.rendered.features.chunks_exact(view.rendered.feature_dim.max(1));
     pixels.flat_map(|f| f[first..first + d].iter().copied()).collect()
 }
 
-/// Previews: exact values are in the EXR and npy files.
+/// Writes previews: exact values are in the EXR and npy files.
 fn png(
     out: &mut WrittenFiles,
     stem: &str,
@@ -112,7 +113,7 @@ fn png(
             }
             Channel::Features => {
                 for (name, first, d, _) in levels(field) {
-                    let image = false_colour(&part(view, first, d), d, &frame.alpha);
+                    let image = false_colour(&level_features(view, first, d), d, &frame.alpha);
                     picture::write_png(&out.file(&format!("{stem}_features_{name}.png"))?, &image)?;
                 }
             }
@@ -122,8 +123,8 @@ fn png(
                 }
             }
             Channel::Codes => {
-                for (name, _, _, at) in levels(field) {
-                    let image = colour::label_image(&view.codes[at]);
+                for (name, _, _, index) in levels(field) {
+                    let image = colour::label_image(&view.codes[index]);
                     picture::write_png(&out.file(&format!("{stem}_codes_{name}.png"))?, &image)?;
                 }
             }
@@ -134,15 +135,16 @@ fn png(
 
 /// The first three components of the unit features as a colour.
 fn false_colour(features: &[f32], d: usize, like: &Image<f32>) -> RgbImage {
-    let colour = |f: &[f32]| {
-        let norm = f.iter().map(|v| v * v).sum::<f32>().sqrt();
-        [0, 1, 2].map(|k| if norm > 0.0 && k < d { 0.5 + 0.5 * f[k] / norm } else { 0.0 })
-    };
     RgbImage {
         width: like.width,
         height: like.height,
-        data: features.chunks_exact(d.max(1)).map(colour).collect(),
+        data: features.chunks_exact(d.max(1)).map(unit_colour).collect(),
     }
+}
+
+fn unit_colour(feature: &[f32]) -> [f32; 3] {
+    let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
+    [0, 1, 2].map(|k| if norm > 0.0 && k < feature.len() { 0.5 + 0.5 * feature[k] / norm } else { 0.0 })
 }
 
 fn exr(
@@ -153,7 +155,7 @@ fn exr(
 ) -> Result<()> {
     let frame = &view.rendered;
     let has = |c: Channel| channels.contains(&c);
-    // OpenEXR holds linear light; what programs that read it expect.
+    // OpenEXR holds linear light.
     let linear = has(Channel::Rgb)
         .then(|| RgbImage { data: frame.rgb.data.iter().map(|c| c.map(to_linear)).collect(), ..frame.rgb });
     let planes = Planes {
@@ -191,7 +193,7 @@ fn arrays(
             Channel::Features => {
                 for (name, first, d, _) in levels(field) {
                     let path = out.file(&format!("{stem}_features_{name}.npy"))?;
-                    picture::write_npy(&path, size, Some(d), &part(view, first, d))?;
+                    picture::write_npy(&path, size, Some(d), &level_features(view, first, d))?;
                 }
             }
             Channel::Unseen => {
@@ -200,8 +202,8 @@ fn arrays(
                 }
             }
             Channel::Codes => {
-                for (name, _, _, at) in levels(field) {
-                    let codes = NpyArray::i32(&[size.1, size.0], view.codes[at].data.clone());
+                for (name, _, _, index) in levels(field) {
+                    let codes = NpyArray::i32(&[size.1, size.0], view.codes[index].data.clone());
                     npy::write(out.file(&format!("{stem}_codes_{name}.npy"))?, &codes)?;
                 }
             }

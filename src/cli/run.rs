@@ -1,6 +1,6 @@
 //! `splatvk run`
 use super::args::{DeviceArgs, SavingArgs, whole};
-use super::kept::tell_of_kept_stages;
+use super::kept::report_kept_stages;
 use super::print::{ending, print, print_json};
 use super::progress;
 use crate::infer::installed::{Inventory, inventory};
@@ -66,11 +66,12 @@ pub fn run(args: &RunArgs) -> Result<()> {
     } else {
         print(&(crate::run::closing_table(&outcome) + &ending(&outcome.plan.output.out)))?;
     }
-    tell_of_kept_stages(progress.as_ref());
+    report_kept_stages(progress.as_ref());
     Ok(())
 }
 
-/// The plan of the arguments: sources named, contradictions refused. No work happens here.
+/// Builds the plan of the arguments: names sources and refuses contradictions. No work happens
+/// here.
 fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
     let asked = ReconstructionConfig {
         geometry: args.geometry.clone(),
@@ -82,7 +83,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         None => asked.resolved(installed)?,
         Some(scene) => {
             let made = base::record_of(scene)?;
-            // Queries that were asked, then those that are new.
+            // The scene's queries, then the new ones.
             queries = made.config.plan.inputs.queries.clone();
             queries.extend(
                 args.queries.iter().filter(|q| !made.config.plan.inputs.queries.contains(q)).cloned(),
@@ -110,8 +111,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
     })
 }
 
-/// The configuration of photos that join a scene: settings that are left open are those of the
-/// scene.
+/// Configuration of photos that join a scene: unset options are those of the scene.
 fn as_made(
     asked: ReconstructionConfig,
     made: &RunRecord,
@@ -130,7 +130,7 @@ fn as_made(
             feature_dim: of_scene.feature_dim,
             per_level: of_scene.per_level,
             compat: of_scene.compat,
-            // Steps that are asked for are done.
+            // Explicit training options win.
             method: method.filter(|m| *m == &SPARSELGS).or(of_scene.method),
             ..language
         }),
@@ -138,7 +138,7 @@ fn as_made(
     .resolved(installed)
 }
 
-/// The source that is asked for; where that is left open, the one that the scene was made with.
+/// The requested source; for `auto` the one that the scene was made with.
 fn source_as_made<K: SourceKind>(
     asked: SourceChoice,
     made: SourceChoice,
@@ -147,21 +147,24 @@ fn source_as_made<K: SourceKind>(
     if asked.name != "auto" {
         return Ok(asked);
     }
-    // The scene knows no folders: it may have come from elsewhere.
+    // The scene may have been moved here from another machine.
     choose::<K>(&made.to_string(), installed).map_err(|e| {
         let option = K::OPTION;
         Error::input(format!("{e} (the scene was made with --{option} {made}; give --{option} again)"))
     })
 }
 
-/// `out/<name>` beside where the command runs; a folder called `images` takes its parent's name.
+/// `out/<name>` in the current folder; a folder called `images` takes its parent's name.
 fn default_out(inputs: &[PathBuf]) -> PathBuf {
     let first = inputs.first().map(PathBuf::as_path).unwrap_or(Path::new("scene"));
     let folder = if first.is_file() { first.parent().unwrap_or(first) } else { first };
     let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_path_buf());
-    let generic = |p: &Path| p.file_name().is_some_and(|n| n == "images" || n == "photos" || n == "input");
-    let named = if generic(&folder) { folder.parent().unwrap_or(&folder) } else { &folder };
+    let named = if has_generic_name(&folder) { folder.parent().unwrap_or(&folder) } else { &folder };
     Path::new("out").join(named.file_name().unwrap_or("scene".as_ref()))
+}
+
+fn has_generic_name(folder: &Path) -> bool {
+    folder.file_name().is_some_and(|n| n == "images" || n == "photos" || n == "input")
 }
 
 #[cfg(test)]
@@ -209,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn presets_are_those_that_are_asked_for() {
+    fn preset_option_sets_preset() {
         use crate::fit::Preset;
         for (name, preset) in
             [("draft", Preset::Draft), ("default", Preset::Default), ("paper", Preset::Paper)]
@@ -219,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn photos_that_join_a_scene_get_masks_and_features_from_where_it_has_its_own() {
+    fn added_photos_take_sources_of_scene() {
         let folder = tempfile::tempdir().unwrap();
         let made = serde_json::json!({ "method": "lift", "masks": "dir:src", "features": "dir:tests" });
         let record = serde_json::json!({ "config": { "plan": made } });
@@ -235,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn auto_takes_the_most_preferred_network_there_is() {
+    fn auto_takes_most_preferred_network() {
         let model = |name: &str, task| Installed {
             name: name.to_owned(),
             family: String::new(),
@@ -257,7 +260,7 @@ mod tests {
         let found = language(&plan);
         assert_eq!((found.masks, found.features), (named("sam_vit_h"), named("mine")));
         assert_eq!((plan.config.geometry.init, found.matcher), (named("mast3r_512"), named("xfeat")));
-        // Depth of a geometry network needs no suggestion, that of stereo takes what there is.
+        // Depth of a geometry network needs no prior, that of stereo takes the installed one.
         assert_eq!(plan.config.geometry.depth_prior, named("none"));
         let plan =
             plan_with(&["--masks", "graph", "--init", "sfm", "--features", "words"], &installed).unwrap();
@@ -268,7 +271,7 @@ mod tests {
     }
 
     #[test]
-    fn each_method_has_its_own_code_length() {
+    fn method_sets_code_length() {
         for (name, dim) in [("sparselgs", 16), ("langsplat", 3), ("legaussians", 8), ("lsm", 16)] {
             let plan = plan(&["--method", name]).unwrap();
             assert_eq!(language(&plan).feature_dim, Some(dim), "{name}");
@@ -276,7 +279,7 @@ mod tests {
     }
 
     #[test]
-    fn what_others_do_is_resolved_in_the_plan() {
+    fn compat_is_resolved_in_plan() {
         let resolved = |extra: &[&str]| language(&plan(extra).unwrap());
         assert_eq!(resolved(&[]).recipe(None).align, AlignOptions::default());
         let paper = resolved(&["--compat", "paper"]);
@@ -292,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn families_and_names_of_networks_are_understood() {
+    fn sources_accept_network_families_and_names() {
         let plan =
             plan(&["--init", "dust3r", "--matcher", "roma", "--masks", "sam_vit_h", "--features", "clip"])
                 .unwrap();
@@ -302,8 +305,8 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_meant_is_refused_with_the_choices() {
-        for (extra, says) in [
+    fn invalid_options_are_refused_with_choices() {
+        for (extra, expected) in [
             (["--init", "colmap"], "auto, sfm, cameras:FILE, mast3r, dust3r"),
             (["--masks", "clip"], "auto, graph, dir:DIR, sam"),
             (["--masks", "dir:nowhere"], "does not exist"),
@@ -314,7 +317,7 @@ mod tests {
             (["--method=langsplat", "--feature-dim=16"], "has 3 dimensions"),
         ] {
             let error = plan(&extra).and_then(|plan| plan.inputs.check()).unwrap_err();
-            assert!(error.exit_code() == 2 && error.to_string().contains(says), "{extra:?}: {error}");
+            assert!(error.exit_code() == 2 && error.to_string().contains(expected), "{extra:?}: {error}");
         }
     }
 }

@@ -1,9 +1,9 @@
-//! The HTTP server of `splatvk view`: one page with its data, and questions, for the browser of the
+//! HTTP server of `splatvk view`: one page with its data, and questions, for the browser of the
 //! user who started it.
 //!
-//! It takes what any process of this machine may send: other pages of the same browser, other
-//! users, requests that never end. All connections share one thread that waits for none of them, so
-//! that no one holds up another.
+//! It must withstand requests of any process of this machine: other pages of the same browser,
+//! other users, requests that never end. All connections share one thread that blocks on none of
+//! them, so that none delays another.
 use crate::error::words;
 use crate::{Error, Result};
 use http_body_util::{BodyExt, Full, LengthLimitError, Limited};
@@ -25,89 +25,88 @@ use tokio::sync::oneshot;
 use tokio::task::AbortHandle;
 use tokio::time::{sleep, timeout};
 
-/// Longest request body, bytes: a question is a few words.
+/// Maximum size of a request body, bytes: a question is a few words.
 const MAX_BODY: usize = 4096;
-/// Longest head of a request, bytes; browsers send one or two thousand.
+/// Maximum size of a request head, bytes; browsers send one or two thousand.
 const MAX_HEAD: usize = 32 << 10;
-/// How long a request may take to arrive, head and body each. On one machine it takes milliseconds.
+/// Time limit for a request to arrive, head and body each. On one machine it takes milliseconds.
 const ARRIVAL: Duration = Duration::from_secs(5);
-/// How long a connection may stay, with its answer and a browser that reads it slowly.
+/// Time limit of a connection, with its answer and a browser that reads it slowly.
 const CONNECTION: Duration = Duration::from_secs(300);
-/// Connections at a time: fewer than the 1,024 files that systems let a process open.
+/// Maximum number of connections: fewer than the 1,024 files that systems let a process open.
 const MAX_OPEN: usize = 256;
-/// Questions that wait for their turn; a browser asks one at a time.
+/// Maximum number of waiting questions; a browser sends one at a time.
 const MAX_WAITING: usize = 16;
-/// How long to wait after the system refused a connection, for want of files or memory.
+/// Pause after the system refused a connection for want of files or memory.
 const REFUSED: Duration = Duration::from_millis(50);
 
-/// What the page may do: run what it carries, ask its own server, and nothing else.
+/// Policy of the page: it runs its own scripts, connects to its own server, and nothing else.
 const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'unsafe-inline' data:; worker-src data:; style-src 'unsafe-inline'; \
                       img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// A JSON text, or status and message of what is refused.
+/// A JSON text, or status and message of a refusal.
 pub type Answer = Result<String, (u16, String)>;
 
-/// A question and where its answer goes.
+/// A question with the receiver of its answer.
 pub struct Question {
-    /// What is asked: not empty.
+    /// Text of the question, not empty.
     pub text: String,
-    /// Closed once nobody waits any more.
+    /// Closed if the connection ended.
     pub reply: oneshot::Sender<Answer>,
 }
 
-/// What is served.
+/// Content of the server.
 pub struct Site {
-    /// The page.
+    /// HTML page.
     pub page: String,
-    /// Name under which the page asks for the scene.
+    /// Path under which the page requests the scene.
     pub scene_path: &'static str,
-    /// The scene.
+    /// Packed scene.
     pub scene: Vec<u8>,
     /// Whether questions are answered.
-    pub asks: bool,
+    pub answers_questions: bool,
 }
 
-/// A port that is taken, and an address that only this process and who reads its output know.
-pub struct Place {
+/// A bound port with a secret path that only this process and readers of its output know.
+pub struct ServerAddress {
     listener: TcpListener,
     port: u16,
-    /// First part of every path: other users of the machine can connect, but not guess it.
+    /// First component of every path: other users of the machine can connect, but not guess it.
     secret: String,
 }
 
-impl Place {
-    /// Takes a port of 127.0.0.1, which no other machine can reach; 0 = a free one.
-    pub fn take(port: u16) -> Result<Place> {
+impl ServerAddress {
+    /// Binds a port of 127.0.0.1, which no other machine can reach; 0 = a free one.
+    pub fn bind(port: u16) -> Result<ServerAddress> {
         let refused = |e: std::io::Error| {
-            let why = words(&e);
-            Error::input(format!("--port {port}: {why}; give another, or leave it out to take a free one"))
+            let reason = words(&e);
+            Error::input(format!("--port {port}: {reason}; give another, or leave it out to take a free one"))
         };
         let listener = TcpListener::bind(SocketAddrV4::new(Ipv4Addr::LOCALHOST, port)).map_err(refused)?;
         listener.set_nonblocking(true).map_err(refused)?;
         let port = listener.local_addr().map_err(refused)?.port();
         let mut random = [0u8; 16];
         getrandom::fill(&mut random).map_err(|e| Error::work(format!("no random numbers: {e}")))?;
-        Ok(Place { listener, port, secret: random.iter().map(|b| format!("{b:02x}")).collect() })
+        Ok(ServerAddress { listener, port, secret: random.iter().map(|b| format!("{b:02x}")).collect() })
     }
 
-    /// Of the page.
-    pub fn address(&self) -> String {
+    /// URL of the page.
+    pub fn url(&self) -> String {
         format!("http://127.0.0.1:{}/{}/", self.port, self.secret)
     }
 }
 
-/// Serves in a thread of its own until the process ends; questions come out of what is returned,
-/// one after the other.
-pub fn serve(place: Place, site: Site) -> Result<Receiver<Question>> {
-    let (questions, asked) = sync_channel(MAX_WAITING);
+/// Serves in a thread of its own until the process ends; returns the receiver of the questions.
+pub fn serve(address: ServerAddress, site: Site) -> Result<Receiver<Question>> {
+    let (sender, questions) = sync_channel(MAX_WAITING);
     let failed = |e: std::io::Error| Error::work(format!("the server cannot start: {}", words(&e)));
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(failed)?;
-    let Place { listener, port, secret } = place;
+    let ServerAddress { listener, port, secret } = address;
     let shared = Arc::new(Shared {
         page: site.page.into(),
         scene_path: site.scene_path,
         scene: site.scene.into(),
-        questions: site.asks.then_some(questions),
+        questions: site.answers_questions.then_some(sender),
         hosts: hosts(port),
         secret,
     });
@@ -115,36 +114,36 @@ pub fn serve(place: Place, site: Site) -> Result<Receiver<Question>> {
         let _inside = runtime.enter();
         tokio::net::TcpListener::from_std(listener).map_err(failed)?
     };
-    let all = move || runtime.block_on(accept(&listener, &shared));
-    std::thread::Builder::new().name("server".into()).spawn(all).map_err(failed)?;
-    Ok(asked)
+    let accept_all = move || runtime.block_on(accept(&listener, &shared));
+    std::thread::Builder::new().name("server".into()).spawn(accept_all).map_err(failed)?;
+    Ok(questions)
 }
 
-/// One connection.
-struct Open {
+/// An open connection.
+struct OpenConnection {
     task: AbortHandle,
     /// Whether it waits for the answer to a question.
     waits: Arc<AtomicBool>,
 }
 
 async fn accept(listener: &tokio::net::TcpListener, shared: &Arc<Shared>) {
-    let mut open: VecDeque<Open> = VecDeque::new();
+    let mut open: VecDeque<OpenConnection> = VecDeque::new();
     loop {
         let Ok((stream, _)) = listener.accept().await else {
             sleep(REFUSED).await;
             continue;
         };
         open.retain(|c| !c.task.is_finished());
-        // The oldest that has not come as far as a question goes: it is slow, or does not read.
+        // Drops the oldest connection without a pending question: it is slow, or does not read.
         if open.len() >= MAX_OPEN
-            && let Some(at) = open.iter().position(|c| !c.waits.load(Ordering::Relaxed))
-            && let Some(oldest) = open.remove(at)
+            && let Some(index) = open.iter().position(|c| !c.waits.load(Ordering::Relaxed))
+            && let Some(oldest) = open.remove(index)
         {
             oldest.task.abort();
         }
         let waits = Arc::new(AtomicBool::new(false));
         let task = tokio::spawn(connection(stream, shared.clone(), waits.clone())).abort_handle();
-        open.push_back(Open { task, waits });
+        open.push_back(OpenConnection { task, waits });
     }
 }
 
@@ -160,7 +159,7 @@ async fn connection(stream: TcpStream, shared: Arc<Shared>, waits: Arc<AtomicBoo
         // A connection per request costs nothing on one machine, and none is left open.
         .keep_alive(false)
         .serve_connection(TokioIo::new(stream), service);
-    // What a browser that went away would have read is lost to nobody.
+    // Errors and timeouts concern only a browser that went away.
     let _ = timeout(CONNECTION, served).await;
 }
 
@@ -169,12 +168,12 @@ struct Shared {
     scene_path: &'static str,
     scene: Bytes,
     questions: Option<SyncSender<Question>>,
-    /// As `Host` may name this server.
+    /// Accepted values of `Host`.
     hosts: Vec<String>,
     secret: String,
 }
 
-/// As `Host` names a server at a port: browsers leave out that of http, 80.
+/// Values of `Host` for a server at a port: browsers omit port 80.
 fn hosts(port: u16) -> Vec<String> {
     let names = ["127.0.0.1", "localhost"];
     let bare = names.iter().filter(|_| port == 80).map(|name| (*name).to_owned());
@@ -191,7 +190,7 @@ impl Shared {
                 (status, "application/json", Bytes::from(json!({ "error": message }).to_string()))
             }
         };
-        // The server leaves the body of an answer to HEAD out, and says how long it would be.
+        // Hyper omits the body of an answer to HEAD, and keeps its length.
         let mut response = Response::new(Full::new(body));
         *response.status_mut() = status;
         for (name, value) in [
@@ -215,8 +214,8 @@ impl Shared {
         if !self.is_own(&request) {
             return Err((StatusCode::FORBIDDEN, "this server answers only the page that it sent".into()));
         }
-        let nothing = || (StatusCode::NOT_FOUND, "there is nothing here".to_owned());
-        let name = self.name(request.uri().path()).ok_or_else(nothing)?.to_owned();
+        let not_found = || (StatusCode::NOT_FOUND, "there is nothing here".to_owned());
+        let name = self.path_after_secret(request.uri().path()).ok_or_else(not_found)?.to_owned();
         match (request.method(), name.as_str()) {
             (&Method::GET | &Method::HEAD, "") => Ok(("text/html; charset=utf-8", self.page.clone())),
             (&Method::GET | &Method::HEAD, name) if name == self.scene_path => {
@@ -229,34 +228,34 @@ impl Shared {
                 waits.store(false, Ordering::Relaxed);
                 Ok(("application/json", answer?.into()))
             }
-            _ => Err(nothing()),
+            _ => Err(not_found()),
         }
     }
 
-    /// What stands behind the secret. All of it is compared whatever differs, so that the time
-    /// tells nothing.
-    fn name<'p>(&self, path: &'p str) -> Option<&'p str> {
+    /// Path after the secret, which is compared in constant time.
+    fn path_after_secret<'p>(&self, path: &'p str) -> Option<&'p str> {
         let (first, name) = path.strip_prefix('/')?.split_once('/')?;
         let differs = first.bytes().zip(self.secret.bytes()).fold(0, |all, (a, b)| all | (a ^ b));
         (first.len() == self.secret.len() && differs == 0).then_some(name)
     }
 
-    /// Other pages in the same browser can reach this address too. A host name of theirs that
-    /// resolves to it shows in `Host`, and a request that their script makes in `Origin`.
+    /// Whether a request comes from the page of this server. Other pages in the same browser can
+    /// reach the address, too: `Host` names their domain if it resolves to this address, and
+    /// `Origin` their site if a script sends the request.
     fn is_own(&self, request: &Request<Incoming>) -> bool {
-        let ours = |host: &str| self.hosts.iter().any(|own| own == host);
-        let host = only(request.headers(), &header::HOST).is_some_and(|h| h.is_some_and(ours));
-        let origin = only(request.headers(), &header::ORIGIN)
-            .is_none_or(|o| o.and_then(|o| o.strip_prefix("http://")).is_some_and(ours));
-        let named = request.uri().authority().is_none_or(|a| ours(a.as_str()));
-        host && origin && named
+        let is_known = |host: &str| self.hosts.iter().any(|known| known == host);
+        let host = single_value(request.headers(), &header::HOST).is_some_and(|h| h.is_some_and(is_known));
+        let origin = single_value(request.headers(), &header::ORIGIN)
+            .is_none_or(|o| o.and_then(|o| o.strip_prefix("http://")).is_some_and(is_known));
+        let authority = request.uri().authority().is_none_or(|a| is_known(a.as_str()));
+        host && origin && authority
     }
 
     async fn ask(&self, text: String) -> Result<String, Refused> {
         let questions = self.questions.as_ref();
         let questions =
             questions.ok_or_else(|| (StatusCode::NOT_FOUND, "this scene answers no questions".to_owned()))?;
-        let busy = |what: &str| (StatusCode::SERVICE_UNAVAILABLE, what.to_owned());
+        let busy = |message: &str| (StatusCode::SERVICE_UNAVAILABLE, message.to_owned());
         let (reply, answer) = oneshot::channel();
         questions
             .try_send(Question { text, reply })
@@ -268,9 +267,8 @@ impl Shared {
     }
 }
 
-/// The one value of a header: `None` where it is not there, `Some(None)` where it is there twice or
-/// no text.
-fn only<'h>(headers: &'h HeaderMap, name: &HeaderName) -> Option<Option<&'h str>> {
+/// Single value of a header: `None` if absent, `Some(None)` if repeated or no text.
+fn single_value<'h>(headers: &'h HeaderMap, name: &HeaderName) -> Option<Option<&'h str>> {
     let mut all = headers.get_all(name).iter();
     let first = all.next()?;
     Some(first.to_str().ok().filter(|_| all.next().is_none()))
@@ -280,7 +278,7 @@ async fn question(request: Request<Incoming>) -> Result<String, Refused> {
     let too_long =
         || (StatusCode::PAYLOAD_TOO_LARGE, format!("a question has at most {MAX_BODY} bytes; ask shorter"));
     let body = request.into_body();
-    // Known before the first byte of it is read.
+    // Checked before the first byte is read.
     if body.size_hint().lower() > MAX_BODY as u64 {
         return Err(too_long());
     }
@@ -299,7 +297,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_port_of_http_may_be_left_out() {
+    fn hosts_omit_port_80() {
         assert_eq!(hosts(8080), ["127.0.0.1:8080", "localhost:8080"]);
         assert_eq!(hosts(80), ["127.0.0.1:80", "localhost:80", "127.0.0.1", "localhost"]);
     }

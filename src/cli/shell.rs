@@ -1,4 +1,4 @@
-//! `splatvk completions`, `splatvk manuals`: what tools/install puts beside the program.
+//! `splatvk completions`, `splatvk manuals`: files that tools/install puts beside the program.
 use super::args::{Cli, CompletionsArgs, ManualsArgs};
 use super::outputs::WrittenFiles;
 use super::print::print;

@@ -1,6 +1,6 @@
 //! `splatvk train`
 use super::args::TrainArgs;
-use super::kept::tell_of_kept_stages;
+use super::kept::report_kept_stages;
 use super::print::{ending, print, print_json};
 use super::progress;
 use crate::run::sources::SourceChoice;
@@ -37,6 +37,6 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         }
         false => print(&(run::closing_table(&outcome) + &ending(&plan.output.out)))?,
     }
-    tell_of_kept_stages(progress.as_ref());
+    report_kept_stages(progress.as_ref());
     Ok(())
 }

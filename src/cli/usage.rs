@@ -1,5 +1,4 @@
-//! What was typed: the definition of the command line, and its mistakes in one line each, with what
-//! may have been meant.
+//! Definition of the command line, and usage errors in one line each, with a suggestion.
 use super::Program;
 use super::args::Cli;
 use super::line::one_line;
@@ -9,27 +8,27 @@ use std::error::Error as _;
 use std::num::{ParseFloatError, ParseIntError};
 use std::process::ExitCode;
 
-/// The command line of a program: the parser, and the source of shell completions.
+/// Command line of a program, for the parser and for shell completions.
 pub fn command<P: Program>() -> Command {
-    built::<P>(P::command())
+    build::<P>(P::command())
 }
 
-/// The command line for man pages: `splatvk help` has none.
+/// Command line for man pages, which `splatvk help` has none of.
 pub fn manual() -> Command {
-    built::<Cli>(Cli::command().disable_help_subcommand(true))
+    build::<Cli>(Cli::command().disable_help_subcommand(true))
 }
 
-fn built<P: Program>(all: Command) -> Command {
+fn build<P: Program>(all: Command) -> Command {
     let mut all = all.mut_subcommands(numbers_may_be_negative);
-    // Options of all commands get into each of them here.
+    // Adds the options of all commands to each of them.
     all.build();
     P::UNUSED.iter().fold(all, |all, (path, options)| hide(all, path, options))
 }
 
 /// "--views -3" is a number that is refused, not an option "-3".
 fn numbers_may_be_negative(command: Command) -> Command {
-    let option = |a: &clap::Arg| a.get_action().takes_values() && !a.is_positional();
-    let command = command.mut_args(|a| if option(&a) { a.allow_negative_numbers(true) } else { a });
+    let takes_value = |a: &clap::Arg| a.get_action().takes_values() && !a.is_positional();
+    let command = command.mut_args(|a| if takes_value(&a) { a.allow_negative_numbers(true) } else { a });
     command.mut_subcommands(numbers_may_be_negative)
 }
 
@@ -42,30 +41,29 @@ fn hide(command: Command, path: &str, options: &[&str]) -> Command {
     }
 }
 
-/// The arguments of this process, or the exit code of a mistake in them, which is printed.
+/// Parses the arguments of this process, or prints the error and returns its exit code.
 pub fn parse<P: Program>() -> Result<P, ExitCode> {
     let parsed = command::<P>().try_get_matches().and_then(|found| P::from_arg_matches(&found));
     parsed.map_err(|error| print_usage_error(&error, &command::<P>()))
 }
 
-/// Help and version go to standard output; what cannot be parsed is one line like every other
-/// error, exit code 2.
+/// Prints help and version to standard output, and a usage error as one line with exit code 2.
 fn print_usage_error(error: &clap::Error, all: &Command) -> ExitCode {
     let help = matches!(
         error.kind(),
         ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand | ErrorKind::MissingSubcommand
     );
-    let asked = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
-    if asked || help {
-        // A closed pipe while printing help is the reader's choice, not a failure.
+    let requested = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
+    if requested || help {
+        // A closed pipe while printing help is no failure.
         let _ = error.print();
-        return if asked { ExitCode::SUCCESS } else { ExitCode::from(2) };
+        return if requested { ExitCode::SUCCESS } else { ExitCode::from(2) };
     }
     eprintln!("{}: {}", all.get_name(), one_line(&message(error, all)));
     ExitCode::from(2)
 }
 
-/// What is wrong, what may have been meant, and which help shows the rest.
+/// Problem, suggestion and the command whose help shows the rest.
 fn message(error: &clap::Error, all: &Command) -> String {
     let text = |kind| texts(error, kind).into_iter().next().unwrap_or_default();
     // "--views <N>": its name is enough.
@@ -79,7 +77,7 @@ fn message(error: &clap::Error, all: &Command) -> String {
         ErrorKind::InvalidSubcommand => {
             let name = text(ContextKind::InvalidSubcommand);
             let near = match meant(ContextKind::SuggestedSubcommand) {
-                none if none.is_empty() => swapped(error, all, &name),
+                none if none.is_empty() => anagram_suggestion(error, all, &name),
                 near => near,
             };
             format!("there is no command {name}{near}")
@@ -104,30 +102,32 @@ fn message(error: &clap::Error, all: &Command) -> String {
         ErrorKind::MissingRequiredArgument => {
             format!("{} missing", texts(error, ContextKind::InvalidArg).join(", "))
         }
-        // The message may go on over several lines before the usage.
+        // The message may span several lines before the usage.
         _ => {
             let text = error.to_string();
             text.split("\n\n").next().unwrap_or(&text).trim_start_matches("error: ").to_owned()
         }
     };
-    format!("{wrong}; {} --help shows what there is", asked_command(error, all))
+    format!("{wrong}; {} --help shows what there is", command_path(error, all))
 }
 
-/// Clap compares places and finds nothing near to "rnu": a command with the same letters in another
-/// order may be meant.
-fn swapped(error: &clap::Error, all: &Command, name: &str) -> String {
-    let sorted = |word: &str| {
-        let mut letters: Vec<char> = word.chars().collect();
-        letters.sort_unstable();
-        letters
-    };
-    let asked = asked_command(error, all);
-    let of = asked.split(' ').skip(1).try_fold(all, |c, word| c.find_subcommand(word));
-    let same = of.and_then(|c| c.get_subcommands().find(|c| sorted(c.get_name()) == sorted(name)));
-    same.map_or(String::new(), |c| format!("; did you mean {}?", c.get_name()))
+/// Suggests a command with the same letters in another order: clap's edit distance finds nothing
+/// near "rnu".
+fn anagram_suggestion(error: &clap::Error, all: &Command, name: &str) -> String {
+    let path = command_path(error, all);
+    let parent = path.split(' ').skip(1).try_fold(all, |c, word| c.find_subcommand(word));
+    let is_anagram = |c: &&Command| sorted_letters(c.get_name()) == sorted_letters(name);
+    let meant = parent.and_then(|c| c.get_subcommands().find(is_anagram));
+    meant.map_or(String::new(), |c| format!("; did you mean {}?", c.get_name()))
 }
 
-/// Why a value is none: the reason of its parser, in words.
+fn sorted_letters(word: &str) -> Vec<char> {
+    let mut letters: Vec<char> = word.chars().collect();
+    letters.sort_unstable();
+    letters
+}
+
+/// Reason of the value's parser, in words.
 fn reason(error: &clap::Error) -> String {
     let Some(source) = error.source() else { return "cannot be used".to_owned() };
     if source.is::<ParseFloatError>() {
@@ -141,13 +141,13 @@ fn reason(error: &clap::Error) -> String {
 
 fn texts(error: &clap::Error, kind: ContextKind) -> Vec<String> {
     match error.get(kind) {
-        Some(ContextValue::String(one)) => vec![one.clone()],
+        Some(ContextValue::String(text)) => vec![text.clone()],
         Some(ContextValue::Strings(all)) => all.clone(),
         _ => Vec::new(),
     }
 }
 
-/// "draft, default or paper".
+/// Joins choices: "draft, default or paper".
 fn choices(all: &[String]) -> String {
     match all {
         [most @ .., last] if !most.is_empty() => format!("{} or {last}", most.join(", ")),
@@ -155,8 +155,8 @@ fn choices(all: &[String]) -> String {
     }
 }
 
-/// The command up to its first argument: "splatvk models list".
-fn asked_command(error: &clap::Error, all: &Command) -> String {
+/// Command path up to its first argument: "splatvk models list".
+fn command_path(error: &clap::Error, all: &Command) -> String {
     let usage = match error.get(ContextKind::Usage) {
         Some(ContextValue::StyledStr(usage)) => usage.to_string(),
         _ => String::new(),
@@ -170,19 +170,19 @@ fn asked_command(error: &clap::Error, all: &Command) -> String {
 mod tests {
     use super::*;
 
-    fn said(line: &[&str]) -> String {
+    fn message_of(line: &[&str]) -> String {
         let all = command::<Cli>();
         let error = all.clone().try_get_matches_from(["splatvk"].iter().chain(line)).unwrap_err();
         one_line(&message(&error, &all))
     }
 
     #[test]
-    fn the_definitions_are_consistent() {
+    fn command_definitions_are_consistent() {
         command::<Cli>().debug_assert();
     }
 
     #[test]
-    fn mistakes_are_named_with_what_was_meant() {
+    fn usage_errors_suggest_near_names() {
         for (line, expected) in [
             (&["rnu"][..], "there is no command rnu; did you mean run?; splatvk --help"),
             (&["models", "lsit"], "there is no command lsit; did you mean list?; splatvk models --help"),
@@ -200,13 +200,13 @@ mod tests {
             (&["run", "x", "--add", "s", "--views", "3"], "cannot be used together with"),
             (&["export", "x", "--format", "plz", "--out", "y"], "--format plz: unknown; did you mean ply?"),
         ] {
-            let text = said(line);
+            let text = message_of(line);
             assert!(text.contains(expected), "{line:?}: {text}");
         }
     }
 
     #[test]
-    fn numbers_are_refused_with_their_range() {
+    fn invalid_numbers_state_their_range() {
         for (line, expected) in [
             (&["run", "x", "--views", "abc"][..], "--views abc: not a whole number; give 2 to 16"),
             (&["run", "x", "--views", "4.0"], "--views 4.0: not a whole number; give 2 to 16"),
@@ -222,26 +222,28 @@ mod tests {
             (&["view", "x", "--port", "70000"], "--port 70000: give 0 to 65535"),
             (&["bench", "--sweep", "1,x"], "--sweep x: not a whole number; give 1 or more"),
         ] {
-            let text = said(line);
+            let text = message_of(line);
             assert!(text.contains(expected), "{line:?}: {text}");
         }
     }
 
+    fn help(path: &str) -> String {
+        let words = path.split(' ');
+        let mut found = words.fold(command::<Cli>(), |c, name| c.find_subcommand(name).unwrap().clone());
+        found.render_help().to_string()
+    }
+
     #[test]
-    fn a_help_shows_what_its_command_uses() {
-        let help = |path: &str| {
-            let found =
-                path.split(' ').fold(command::<Cli>(), |c, name| c.find_subcommand(name).unwrap().clone());
-            { found }.render_help().to_string()
-        };
+    fn help_shows_only_used_options() {
         for path in ["clean", "models list", "export"] {
             let text = help(path);
             assert!(!text.contains("--provider") && !text.contains("--log"), "{path}: {text}");
         }
         let text = help("run");
-        let at =
+        let position =
             |option: &str| text.find(&format!("{option} ")).unwrap_or_else(|| panic!("{option}: {text}"));
-        assert!(at("--query") < at("--views") && at("--max-size") < at("--compat"), "{text}");
+        assert!(position("--query") < position("--views"), "{text}");
+        assert!(position("--max-size") < position("--compat"), "{text}");
         let headings: Vec<&str> = text.lines().filter(|l| l.ends_with(':') && !l.starts_with(' ')).collect();
         assert!(headings.len() >= 5, "{headings:?}");
     }

@@ -3,7 +3,7 @@ use super::args::ViewArgs;
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
-use super::serve::{Answer, Place, Site, serve};
+use super::serve::{Answer, ServerAddress, Site, serve};
 use crate::format::scene_dir::Scene;
 use crate::format::scene_photos;
 use crate::gpu;
@@ -19,7 +19,7 @@ use serde_json::json;
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
-/// How soon Ctrl-C is noticed between questions.
+/// Interval at which Ctrl-C is noticed between questions.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 pub fn view(args: &ViewArgs) -> Result<()> {
@@ -27,9 +27,9 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     if scene.splats.is_empty() {
         return Err(Error::input(format!("{}: no splats to show", args.scene.display())));
     }
-    // Bound first: a port that is taken is said before the scene is prepared.
-    let place = Place::take(args.port)?;
-    let (mut ready, no_questions) = match questions(&scene, args) {
+    // The port is bound first: one that is in use is reported before the scene is prepared.
+    let server = ServerAddress::bind(args.port)?;
+    let (mut ready, no_questions) = match query_scene(&scene, args) {
         Ok(ready) => (Some(ready), None),
         Err(error) => (None, Some(error.to_string())),
     };
@@ -42,37 +42,36 @@ pub fn view(args: &ViewArgs) -> Result<()> {
         page: page(&scene, args, &names, no_questions.as_deref())?,
         scene_path: SCENE_PATH,
         scene: viewer::pack(&scene.splats, &scene.seen, scene.language.as_ref(), usize::MAX)?.bytes,
-        asks: ready.is_some(),
+        answers_questions: ready.is_some(),
     };
-    let address = place.address();
-    let asked = serve(place, site)?;
+    let address = server.url();
+    let questions = serve(server, site)?;
     if args.device.json {
         print_json(&json!({ "address": address, "scene": args.scene, "questions": ready.is_some() }))?;
     } else {
         print(&format!("{} is at {address}  (Ctrl-C ends)\n", args.scene.display()))?;
     }
-    // From here on there is nothing that stopping could leave undone, also while a question is
-    // answered.
-    progress::stopping_is_no_failure();
+    // From here on stopping leaves nothing undone, even while a question is answered.
+    progress::stop_without_error();
     let input = StandardInput::new();
     while !progress::stopped() && !input.has_closed() {
-        match asked.recv_timeout(POLL_INTERVAL) {
-            // Nobody waits for the answer any more: the page was closed.
+        match questions.recv_timeout(POLL_INTERVAL) {
+            // The page was closed while its question waited.
             Ok(question) if question.reply.is_closed() => {}
             Ok(question) => {
                 let answer = reply(ready.as_mut(), &question.text, &options);
                 let _ = question.reply.send(answer);
             }
             Err(RecvTimeoutError::Timeout) => {}
-            // Without questions nobody holds the other end.
+            // Without questions the server has no sender.
             Err(RecvTimeoutError::Disconnected) => std::thread::sleep(POLL_INTERVAL),
         }
     }
     Ok(())
 }
 
-/// The scene ready for questions, looked at from its own cameras.
-fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
+/// Prepares the scene for questions in its own views.
+fn query_scene(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
     let field = scene.language.clone().ok_or_else(|| Error::input("this scene has no language"))?;
     let encoder = encoder::of_scene(scene, args.device.registry()?)?;
     let device = gpu::open(args.device.device.as_deref())?;
@@ -82,8 +81,7 @@ fn questions(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
 }
 
 fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<&str>) -> Result<String> {
-    // Photos are decoration here: a scene whose pictures were deleted still shows, and one that
-    // names pictures elsewhere.
+    // Photos are optional: a scene without its images, or with images elsewhere, is still shown.
     let load = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
     let photos: Option<Vec<_>> = scene.cameras.iter().map(load).collect();
     let images: Vec<RgbImage> = photos.unwrap_or_default().into_iter().map(|p| p.image).collect();
@@ -113,10 +111,9 @@ fn reply(ready: Option<&mut QueryScene>, text: &str, options: &QueryOptions) -> 
     Ok(reply.to_string())
 }
 
-/// Tells when whoever started this process has gone: the terminal was closed, or the other end of a
-/// pipe. Nothing is read.
+/// Detects that the parent of this process is gone, by a closed terminal or pipe. Nothing is read.
 struct StandardInput {
-    /// Not where it was closed from the beginning: it then says nothing.
+    /// False if standard input was closed from the beginning, and so carries no information.
     watched: bool,
 }
 

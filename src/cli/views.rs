@@ -6,15 +6,15 @@ use crate::scene::Camera;
 use crate::{Error, Result};
 use std::path::Path;
 
-/// The cameras of a file as views to render; what of the file is not used is said.
+/// Reads the cameras of a file as views to render, and prints its warnings.
 pub fn read(path: &Path) -> Result<Vec<Camera>> {
     let (cameras, warnings) = cameras::read_file(path)?.pinholes();
     warnings.iter().for_each(|w| progress::print_warning(w));
     Ok(cameras)
 }
 
-/// One stem per camera, with folders of its name where that of the file is not its own; two of one
-/// name would overwrite each other's files.
+/// One stem per camera, with parent folders where file names repeat. Two equal names are refused:
+/// their files would overwrite each other.
 pub fn stems(list: &[Camera]) -> Result<Vec<String>> {
     let stems = stems_apart(&list.iter().map(|c| c.name.as_str()).collect::<Vec<_>>());
     for (i, stem) in stems.iter().enumerate() {

@@ -1,13 +1,13 @@
-//! The figures of one frame: colour fit, depth, masks.
+//! Scores of one frame: colour fit, depth, masks.
 use crate::math::median;
 use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 use serde::Serialize;
 
-/// Pixels less opaque than this have no depth to compare.
+/// Minimum opacity of pixels whose depth is compared.
 const SOLID: f32 = 0.5;
 
-/// Per channel the gain and the offset that bring a render closest to a photo (least squares).
+/// Applies the gain and offset per channel that bring a render closest to a photo (least squares).
 pub fn colour_fit(rendered: &RgbImage, photo: &RgbImage) -> RgbImage {
     let n = rendered.data.len().max(1) as f64;
     let fits: [(f64, f64); 3] = [0, 1, 2].map(|c| {
@@ -20,7 +20,7 @@ pub fn colour_fit(rendered: &RgbImage, photo: &RgbImage) -> RgbImage {
             xy += r * p;
         }
         let spread = xx - x * x / n;
-        // A render of one colour has nothing to scale.
+        // A render of constant colour has no gain.
         let gain = if spread > 1e-9 * n { (xy - x * y / n) / spread } else { 0.0 };
         (gain, (y - gain * x) / n)
     });
@@ -31,7 +31,7 @@ pub fn colour_fit(rendered: &RgbImage, photo: &RgbImage) -> RgbImage {
     RgbImage { width: rendered.width, height: rendered.height, data: data.collect() }
 }
 
-/// Depth against the truth, where both are known.
+/// Depth errors over pixels with true depth.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct DepthScore {
@@ -43,8 +43,8 @@ pub struct DepthScore {
     pub delta: f64,
 }
 
-/// Depth of solid pixels; `scale` is that of the cameras, scene → truth. `None` without common
-/// pixels.
+/// Scores the depth of solid pixels; `scale` maps scene to truth, from the cameras. `None` without
+/// common pixels.
 pub fn depth_score(
     depth: &Image<f32>,
     alpha: &Image<f32>,
@@ -54,14 +54,15 @@ pub fn depth_score(
     let pairs = depth.data.iter().zip(&alpha.data).zip(&truth.data);
     let solid = pairs.filter(|((z, a), t)| **z > 0.0 && **a >= SOLID && **t > 0.0);
     let pairs: Vec<(f64, f64)> = solid.map(|((z, _), t)| (f64::from(*z), f64::from(*t))).collect();
-    let median_of = |of: &dyn Fn(&(f64, f64)) -> f64| median(&mut pairs.iter().map(of).collect::<Vec<_>>());
-    let own = median_of(&|p| p.1)? / median_of(&|p| p.0)?;
+    let median_of =
+        |value: &dyn Fn(&(f64, f64)) -> f64| median(&mut pairs.iter().map(value).collect::<Vec<_>>());
+    let own_scale = median_of(&|p| p.1)? / median_of(&|p| p.0)?;
     let n = pairs.len() as f64;
-    let near = |p: &&(f64, f64)| (own * p.0 / p.1).max(p.1 / (own * p.0)) < 1.25;
+    let is_close = |p: &&(f64, f64)| (own_scale * p.0 / p.1).max(p.1 / (own_scale * p.0)) < 1.25;
     Some(DepthScore {
         median_relative: median_of(&|(z, t)| (z * scale - t).abs() / t)?,
-        abs_rel: pairs.iter().map(|(z, t)| (own * z - t).abs() / t).sum::<f64>() / n,
-        delta: pairs.iter().filter(near).count() as f64 / n,
+        abs_rel: pairs.iter().map(|(z, t)| (own_scale * z - t).abs() / t).sum::<f64>() / n,
+        delta: pairs.iter().filter(is_close).count() as f64 / n,
     })
 }
 
@@ -84,7 +85,7 @@ pub fn iou(mask: &Image<bool>, objects: &Image<u32>, label: u32) -> Result<f64> 
     Ok(both as f64 / either.max(1) as f64)
 }
 
-/// The picture as an 8-bit file holds it, so that figures can be recomputed from the files.
+/// Rounds an image to 8 bits, so that scores can be recomputed from the files.
 pub(super) fn quantised(image: &RgbImage) -> RgbImage {
     let data = image.data.iter().map(|c| c.map(|v| (v.clamp(0.0, 1.0) * 255.0).round() / 255.0)).collect();
     RgbImage { width: image.width, height: image.height, data }
@@ -100,13 +101,13 @@ mod tests {
     }
 
     #[test]
-    fn depth_is_scored_over_solid_pixels() {
+    fn depth_score_counts_solid_pixels() {
         let depth = plane(vec![1.0, 2.2, 4.0, 9.0, 0.0]);
         let alpha = plane(vec![1.0, 1.0, 1.0, 0.2, 1.0]);
         let truth = plane(vec![2.0, 4.0, 4.0, 1.0, 1.0]);
         let score = depth_score(&depth, &alpha, &truth, 2.0).unwrap();
         assert!((score.median_relative - 0.1).abs() < 1e-6, "{score:?}");
-        // own scale 4 / 2.2: 1.818, 4, 7.27 against 2, 4, 4
+        // The frame's own scale is 4 / 2.2: 1.818, 4, 7.27 against 2, 4, 4.
         let s = 4.0 / 2.2;
         let mean = ((2.0 - s) / 2.0 + (4.0 * s - 4.0) / 4.0) / 3.0;
         assert!((score.abs_rel - mean).abs() < 1e-6 && (score.delta - 2.0 / 3.0).abs() < 1e-9, "{score:?}");
@@ -114,14 +115,14 @@ mod tests {
     }
 
     #[test]
-    fn a_colour_fit_takes_out_gain_and_offset_and_nothing_else() {
+    fn colour_fit_removes_gain_and_offset() {
         let value = |k: usize| [0, 3, 7].map(|c| 0.2 + 0.4 * ((k * 37 + c * 11) % 64) as f32 / 64.0);
         let photo = RgbImage { width: 16, height: 12, data: (0..192).map(value).collect() };
         let dimmed = |v: &[f32; 3]| [0.8 * v[0] + 0.05, 0.7 * v[1], 1.1 * v[2] - 0.02];
         let render = RgbImage { data: photo.data.iter().map(dimmed).collect(), ..photo.clone() };
         assert!(psnr(&render, &photo) < 25.0);
         assert!(psnr(&colour_fit(&render, &photo), &photo) > 100.0);
-        // turned upside down it stays wrong, and never gets worse
+        // Turned upside down it stays wrong, and never gets worse.
         let turned = RgbImage { data: photo.data.iter().rev().copied().collect(), ..photo.clone() };
         let (before, after) = (psnr(&turned, &photo), psnr(&colour_fit(&turned, &photo), &photo));
         assert!(after >= before && after < 25.0, "{before} {after}");

@@ -1,4 +1,4 @@
-//! Things in space against the true ones.
+//! Instances against the true objects.
 use super::truth::{GroundTruth, Split};
 use crate::Result;
 use crate::math::{median, quantile};
@@ -8,26 +8,27 @@ use glam::{DVec2, DVec3};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// Share of an object's pixels that may lie outside its box on either side: rims of depth.
+/// Share of an object's pixels that may lie outside its box on either side: depth noise at its rim.
 const OUTSIDE: f64 = 0.02;
 
-/// How many things answered a phrase, and where.
+/// Number and positions of the instances of a phrase.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct InstanceScore {
     /// The phrase.
     pub phrase: String,
-    /// Objects that it means: of its own label, and of labels that end with it ("dark red ball").
+    /// Objects of the phrase: with its own label, or with a label that ends with it ("dark red
+    /// ball").
     pub expected: usize,
-    /// Things found.
+    /// Number of instances found.
     pub found: usize,
-    /// Per expected object the distance from the middle of what the photos show of it to that of
-    /// the nearest thing, true units.
+    /// Distance from the middle of each expected object, over its visible pixels, to the nearest
+    /// instance, true units.
     pub centre_distance: Vec<f64>,
 }
 
-/// Label → phrase and middle of what the train frames show of it, true world; those of which they
-/// show `least` pixels.
+/// Phrase and middle of the visible surface of every label with at least `least` pixels in the
+/// train frames, true world.
 pub(super) fn middles(
     truth: &GroundTruth,
     phrases: Vec<(u32, String)>,
@@ -45,19 +46,21 @@ pub(super) fn middles(
             }
         }
     }
-    let middle = |points: &Vec<DVec3>| {
-        let along = |k: usize| {
-            let mut at: Vec<f64> = points.iter().map(|p| p[k]).collect();
-            let ends = (quantile(&mut at, OUTSIDE)?, quantile(&mut at, 1.0 - OUTSIDE)?);
-            Some(0.5 * (ends.0 + ends.1))
-        };
-        Some(DVec3::new(along(0)?, along(1)?, along(2)?))
-    };
-    let solid = |label: &u32| points.get(label).filter(|points| points.len() >= least);
-    Ok(phrases.into_iter().filter_map(|(label, phrase)| Some((phrase, middle(solid(&label)?)?))).collect())
+    let visible = |label: &u32| points.get(label).filter(|points| points.len() >= least);
+    Ok(phrases.into_iter().filter_map(|(label, phrase)| Some((phrase, middle(visible(&label)?)?))).collect())
 }
 
-/// The score of a phrase; `None` where the photos show nothing of what it means.
+/// Centre of the box of points without the share [`OUTSIDE`] on either side.
+fn middle(points: &[DVec3]) -> Option<DVec3> {
+    let along = |k: usize| {
+        let mut coordinates: Vec<f64> = points.iter().map(|p| p[k]).collect();
+        let ends = (quantile(&mut coordinates, OUTSIDE)?, quantile(&mut coordinates, 1.0 - OUTSIDE)?);
+        Some(0.5 * (ends.0 + ends.1))
+    };
+    Some(DVec3::new(along(0)?, along(1)?, along(2)?))
+}
+
+/// Scores a phrase; `None` if the photos show none of its objects.
 pub(super) fn score(
     middles: &[(String, DVec3)],
     phrase: &str,
@@ -65,10 +68,10 @@ pub(super) fn score(
     to_truth: &Similarity,
 ) -> Option<InstanceScore> {
     let ending = format!(" {phrase}");
-    let meant = |label: &str| label == phrase || label.ends_with(&ending);
-    let expected: Vec<DVec3> = middles.iter().filter(|(label, _)| meant(label)).map(|m| m.1).collect();
-    let places: Vec<DVec3> = found.iter().map(|i| to_truth.transform(i.centre)).collect();
-    let nearest = |at: &DVec3| places.iter().map(|p| p.distance(*at)).reduce(f64::min);
+    let matches = |label: &str| label == phrase || label.ends_with(&ending);
+    let expected: Vec<DVec3> = middles.iter().filter(|(label, _)| matches(label)).map(|m| m.1).collect();
+    let centres: Vec<DVec3> = found.iter().map(|i| to_truth.transform(i.centre)).collect();
+    let nearest = |middle: &DVec3| centres.iter().map(|c| c.distance(*middle)).reduce(f64::min);
     (!expected.is_empty()).then(|| InstanceScore {
         phrase: phrase.to_owned(),
         expected: expected.len(),
@@ -77,7 +80,7 @@ pub(super) fn score(
     })
 }
 
-/// Median distance and share of phrases with the right number.
+/// Median distance, and share of phrases with the right number of instances.
 pub(super) fn summary(scores: &[InstanceScore]) -> Option<(f64, f64)> {
     let right = scores.iter().filter(|s| s.found == s.expected).count();
     let mut distances: Vec<f64> = scores.iter().flat_map(|s| s.centre_distance.iter().copied()).collect();
@@ -90,14 +93,14 @@ mod tests {
     use glam::DMat3;
 
     #[test]
-    fn things_are_compared_in_the_world_of_the_truth() {
-        // (x, y) of the scene is (1 − 2y, 2x) there.
+    fn instances_are_compared_in_true_world() {
+        // The truth has (1 − 2y, 2x) for (x, y) of the scene.
         let rotation = DMat3::from_rotation_z(std::f64::consts::FRAC_PI_2);
         let to_truth = Similarity { scale: 2.0, rotation, translation: DVec3::X };
-        let at = |x: f64, y: f64| Instance { centre: DVec3::new(x, y, 0.0), ..Instance::default() };
+        let instance = |x: f64, y: f64| Instance { centre: DVec3::new(x, y, 0.0), ..Instance::default() };
         let middles = [("red ball", 1.0, 2.0), ("dark red ball", -3.0, 0.0), ("mug", 1.0, 1.0)]
             .map(|(label, x, y)| (label.to_owned(), DVec3::new(x, y, 0.0)));
-        let found = [at(0.0, 2.0), at(1.0, 0.0)];
+        let found = [instance(0.0, 2.0), instance(1.0, 0.0)];
         let balls = score(&middles, "red ball", &found, &to_truth).unwrap();
         assert_eq!((balls.expected, balls.found, balls.centre_distance.len()), (2, 2, 2));
         assert!(balls.centre_distance.iter().all(|d| *d < 1e-9), "{balls:?}");

@@ -1,26 +1,25 @@
-//! Lengths in the scene against the true ones: what a tape measure is worth once one length is
-//! known.
+//! Lengths in the scene against the true ones: accuracy of measurements once one length is known.
 use crate::math::{Random, quantile};
 use glam::DVec3;
 use serde::Serialize;
 
-/// Relative errors of lengths when another one, any, gave the scene its scale.
+/// Relative errors of lengths when any other length gave the scene its scale.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct LengthScore {
-    /// Lengths that were compared.
+    /// Number of compared lengths.
     pub lengths: usize,
     /// Median of |l / l_true − 1|.
     pub median: f64,
-    /// Nine tenths are below.
+    /// 90th percentile of |l / l_true − 1|.
     pub p90: f64,
 }
 
-/// Pairs of lengths drawn: quantiles over them are right to a few hundredths of themselves.
+/// Drawn pairs of lengths: their quantiles are accurate to a few hundredths of their value.
 const DRAWN: usize = 20_000;
 
-/// Over the distances of all pairs of places, (scene, truth), that are truly at least `least`
-/// apart; the true places of a pair differ. `None` with fewer than two lengths.
+/// Scores the distances of all pairs of `places`, (scene, truth), whose true distance is at least
+/// `least`; the true places of a pair differ. `None` with fewer than two lengths.
 pub(super) fn length_score(places: &[(DVec3, DVec3)], least: f64) -> Option<LengthScore> {
     let pairs = (0..places.len()).flat_map(|j| (0..j).map(move |i| (i, j)));
     let ratio = |(i, j): (usize, usize)| {
@@ -50,20 +49,22 @@ pub(super) fn length_score(places: &[(DVec3, DVec3)], least: f64) -> Option<Leng
 mod tests {
     use super::*;
 
+    /// Random places, stretched in the scene: (scene, truth).
+    fn places(stretch: DVec3) -> Vec<(DVec3, DVec3)> {
+        let mut random = Random::new(1);
+        (0..40)
+            .map(|_| {
+                let p = DVec3::new(random.uniform(), random.uniform(), random.uniform());
+                (3.0 * p * stretch, p)
+            })
+            .collect()
+    }
+
     #[test]
-    fn scale_is_no_error_and_stretch_is() {
-        let places = |stretch: DVec3| -> Vec<(DVec3, DVec3)> {
-            let mut random = Random::new(1);
-            (0..40)
-                .map(|_| {
-                    let p = DVec3::new(random.uniform(), random.uniform(), random.uniform());
-                    (3.0 * p * stretch, p)
-                })
-                .collect()
-        };
+    fn length_score_ignores_scale_not_stretch() {
         let exact = length_score(&places(DVec3::ONE), 0.1).unwrap();
         assert!(exact.p90 < 1e-9 && exact.lengths > 500, "{exact:?}");
-        // Along one axis 10 % too long: lengths disagree by up to as much.
+        // One axis is 10 % too long: lengths disagree by up to as much.
         let deep = length_score(&places(DVec3::new(1.0, 1.0, 1.1)), 0.1).unwrap();
         assert!(deep.median > 0.01 && deep.median < 0.05 && deep.p90 < 0.1, "{deep:?}");
         assert_eq!(length_score(&places(DVec3::ONE)[..2], 0.0), None);

@@ -1,10 +1,10 @@
 //! Scoring a scene against known cameras, depth and object masks: the building blocks of `splatvk
 //! eval`.
 //!
-//! A caller opens [`GroundTruth`], asks [`Evaluation::cameras`] for every frame's camera in the
-//! scene's world, renders it, answers each label's phrase with [`crate::query::answer`] and hands
-//! both to [`Evaluation::add_frame`]; the figures agree with an independent scorer that reads only
-//! the files written.
+//! A caller opens [`GroundTruth`], takes every frame's camera in the scene's world from
+//! [`Evaluation::cameras`], renders it, answers each label's phrase with [`crate::query::answer`]
+//! and passes both to [`Evaluation::add_frame`]; the scores agree with an independent scorer that
+//! reads only the written files.
 mod figures;
 mod instances;
 mod lengths;
@@ -41,16 +41,17 @@ use report::DEFINITIONS;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Labels of surfaces behind the objects; the scorer leaves them out of mIoU.
+/// Labels of surfaces behind the objects, excluded from mIoU.
 pub const BACKGROUND_LABELS: [&str; 6] =
     ["wooden table", "dark wooden table", "brick wall", "plaster wall", "grey carpet", "marble floor"];
 
-/// Views that show fewer pixels of an object do not count for it.
+/// Minimum number of pixels of an object in a view that counts for it.
 pub const MIN_OBJECT_PIXELS: usize = 100;
 
-/// Columns and rows of pixels whose distances are compared with the true ones.
+/// Columns and rows of the pixels whose distances are compared with the true ones.
 const LENGTH_GRID: [usize; 2] = [8, 6];
-/// Shortest of them, share of the mean depth: shorter ones would measure the noise of their ends.
+/// Minimum of these lengths as a share of the mean depth: shorter ones would measure the noise of
+/// their ends.
 const LEAST_LENGTH: f64 = 0.1;
 
 /// One rendered frame.
@@ -60,7 +61,7 @@ pub struct Rendered {
     pub rgb: RgbImage,
     /// Accumulated opacity.
     pub alpha: Image<f32>,
-    /// Camera z in scene units, 0 where nothing is.
+    /// Camera z in scene units, 0 = no surface.
     pub depth: Image<f32>,
 }
 
@@ -75,19 +76,16 @@ struct IntrinsicsOffset {
 }
 
 impl IntrinsicsOffset {
-    fn of(estimated: &[Camera], known: &[Camera]) -> IntrinsicsOffset {
+    fn between(estimated: &[Camera], known: &[Camera]) -> IntrinsicsOffset {
         let median = |value: &dyn Fn(&Camera, &Camera) -> f64| {
             let mut all: Vec<f64> = estimated.iter().zip(known).map(|(e, k)| value(e, k)).collect();
             crate::math::median(&mut all).unwrap_or(0.0)
         };
-        let of_width = |c: &Camera, x: f64| x / f64::from(c.width);
-        let of_height = |c: &Camera, y: f64| y / f64::from(c.height);
+        let [focal, cx, cy]: [fn(&Camera) -> f64; 3] =
+            [|c| c.fx / f64::from(c.width), |c| c.cx / f64::from(c.width), |c| c.cy / f64::from(c.height)];
         IntrinsicsOffset {
-            focal: median(&|e, k| of_width(e, e.fx) / of_width(k, k.fx)),
-            centre: [
-                median(&|e, k| of_width(e, e.cx) - of_width(k, k.cx)),
-                median(&|e, k| of_height(e, e.cy) - of_height(k, k.cy)),
-            ],
+            focal: median(&|e, k| focal(e) / focal(k)),
+            centre: [median(&|e, k| cx(e) - cx(k)), median(&|e, k| cy(e) - cy(k))],
         }
     }
 }
@@ -98,7 +96,7 @@ pub struct Evaluation {
     similarity: Similarity,
     intrinsics_offset: IntrinsicsOffset,
     out: Option<PathBuf>,
-    /// Places on surfaces that train frames show: in the scene, and true.
+    /// Surface points in train frames: (scene, truth).
     surface: Vec<(DVec3, DVec3)>,
     /// Mean true depth.
     mean_depth: f64,
@@ -106,11 +104,11 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
-    /// Matches the scene's cameras (by file stem) with the train frames and finds the similarity
+    /// Matches the scene's cameras (by file stem) with the train frames and computes the similarity
     /// scene → truth from them alone. With `out`, renders and masks are written there.
     pub fn new(truth: GroundTruth, scene: &[Camera], out: Option<&Path>) -> Result<Self> {
         let mut pairs: Vec<(Camera, &TruthFrame)> = Vec::new();
-        let asked = truth.frames.iter().filter(|f| f.split == Split::Train).count();
+        let requested = truth.frames.iter().filter(|f| f.split == Split::Train).count();
         for frame in truth.frames.iter().filter(|f| f.split == Split::Train) {
             let found = scene.iter().find(|c| stem(&c.name) == frame.stem);
             pairs.extend(found.map(|c| (c.clone(), frame)));
@@ -128,7 +126,7 @@ impl Evaluation {
         let estimated: Vec<Camera> = pairs.iter().map(|(c, _)| c.clone()).collect();
         let known: Vec<Camera> = frames.iter().map(|f| f.camera.clone()).collect();
         let errors = pose_errors(&estimated, &known, mean_depth);
-        let relative_poses = relative(&frames, &estimated, &known, asked);
+        let relative_poses = relative_score(&frames, &estimated, &known, requested);
         let centres: Vec<_> =
             estimated.iter().zip(&known).map(|(e, k)| (e.pose.centre(), k.pose.centre())).collect();
         let report = EvalReport {
@@ -137,27 +135,27 @@ impl Evaluation {
             camera_lengths: length_score(&centres, 0.0),
             ..EvalReport::default()
         };
-        let (similarity, intrinsics_offset) = (errors.similarity, IntrinsicsOffset::of(&estimated, &known));
+        let (similarity, intrinsics_offset) =
+            (errors.similarity, IntrinsicsOffset::between(&estimated, &known));
         let out = out.map(Path::to_path_buf);
         Ok(Evaluation { similarity, intrinsics_offset, out, surface: Vec::new(), mean_depth, report, truth })
     }
 
-    /// Scores the scene's direction up, as far as it is known.
+    /// Scores the scene's direction up, if known.
     pub fn add_world(&mut self, world: &World) {
         let angle = |up: &Up, truth: DVec3| (self.similarity.rotation * up.direction).angle_between(truth);
         let known = world.up.as_ref().zip(self.truth.up);
         self.report.up_degrees = known.map(|(up, truth)| angle(up, truth).to_degrees());
     }
 
-    /// The frames and, for each, the camera of the truth expressed in the scene's world, at the
-    /// truth's size.
+    /// The frames, each with its true camera in the scene's world, at the truth's size.
     pub fn cameras(&self) -> Vec<(TruthFrame, Camera)> {
         self.truth.frames.iter().map(|f| (f.clone(), to_scene(&f.camera, &self.similarity))).collect()
     }
 
-    /// A camera of the truth with the optics that the scene found for its own photos: what a photo
-    /// taken with the same camera shows of the scene if the scene is right about itself.
-    pub fn with_scene_optics(&self, camera: &Camera) -> Camera {
+    /// A true camera with the intrinsics that the scene estimated for its own photos. A photo by
+    /// the same physical camera shows this view if the estimate is right.
+    pub fn with_scene_intrinsics(&self, camera: &Camera) -> Camera {
         let IntrinsicsOffset { focal, centre: [x, y] } = self.intrinsics_offset;
         Camera {
             fx: camera.fx * focal,
@@ -168,13 +166,13 @@ impl Evaluation {
         }
     }
 
-    /// (object index, phrase) to ask for; background labels are left out.
+    /// (object index, phrase) of the queries, without background labels.
     pub fn phrases(&self) -> Vec<(u32, String)> {
         let all = self.truth.labels.iter();
         all.filter(|(_, p)| !BACKGROUND_LABELS.contains(&p.as_str())).map(|(k, p)| (*k, p.clone())).collect()
     }
 
-    /// Scores the things that answered each of [`Evaluation::phrases`], in their order.
+    /// Scores the instances of each of [`Evaluation::phrases`], in their order.
     pub fn add_instances(&mut self, found: &[Vec<Instance>]) -> Result<()> {
         let phrases = self.phrases();
         let middles = instances::middles(&self.truth, phrases.clone(), MIN_OBJECT_PIXELS)?;
@@ -190,7 +188,7 @@ impl Evaluation {
         self.truth.image(frame)
     }
 
-    /// Scores one frame; `answers` holds the result per asked object index, in frame size.
+    /// Scores one frame; `answers` holds (object index, result) at frame size.
     pub fn add_frame(
         &mut self,
         frame: &TruthFrame,
@@ -206,7 +204,7 @@ impl Evaluation {
         Ok(())
     }
 
-    /// Notes places of a train frame whose true depth is known.
+    /// Collects surface points of a train frame with true depth.
     fn add_surface(&mut self, frame: &TruthFrame, rendered: &Rendered) -> Result<()> {
         let Some(truth) = self.truth.depth(frame)? else { return Ok(()) };
         let camera = to_scene(&frame.camera, &self.similarity);
@@ -258,7 +256,7 @@ impl Evaluation {
         let depth = self.truth.depth(frame)?;
         let depth =
             depth.and_then(|d| depth_score(&rendered.depth, &rendered.alpha, &d, self.similarity.scale));
-        // A white or black frame around a photo is no part of the scene.
+        // A plain border around a photo is not part of the scene.
         let border = crate::photo::PlainBorder::of(&target);
         let (inner, photo) = (border.crop(&shown), border.crop(&target));
         let image = ImageScore {
@@ -319,19 +317,25 @@ impl Evaluation {
 
 fn pose_scores(frames: &[&TruthFrame], errors: &PoseErrors) -> Vec<PoseScore> {
     let rows = frames.iter().zip(&errors.rotation_degrees).zip(&errors.centre).zip(&errors.focal);
-    let score = |(((f, r), c), k): (((&&TruthFrame, &f64), &f64), &f64)| PoseScore {
-        frame: f.stem.clone(),
-        rotation_degrees: *r,
-        centre_fraction: *c,
-        focal_relative: *k,
-    };
-    rows.map(score).collect()
+    rows.map(|(((frame, rotation), centre), focal)| PoseScore {
+        frame: frame.stem.clone(),
+        rotation_degrees: *rotation,
+        centre_fraction: *centre,
+        focal_relative: *focal,
+    })
+    .collect()
 }
 
-/// `asked`: train frames of the truth; a frame that the scene lacks fails in all its pairs.
-fn relative(frames: &[&TruthFrame], estimated: &[Camera], known: &[Camera], asked: usize) -> RelativeScore {
+/// Scores relative poses. `requested` train frames are in the truth; a frame that the scene lacks
+/// fails in all its pairs.
+fn relative_score(
+    frames: &[&TruthFrame],
+    estimated: &[Camera],
+    known: &[Camera],
+    requested: usize,
+) -> RelativeScore {
     let errors = pair_errors(estimated, known);
-    let missing = asked * asked.saturating_sub(1) / 2 - errors.len();
+    let missing = requested * requested.saturating_sub(1) / 2 - errors.len();
     let pairs = errors.iter().map(|e| PairScore {
         frames: e.pair.map(|k| frames[k].stem.clone()),
         rotation_degrees: e.rotation_degrees,
@@ -345,8 +349,11 @@ fn relative(frames: &[&TruthFrame], estimated: &[Camera], known: &[Camera], aske
     }
 }
 
+fn mean(values: Vec<f64>) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
 fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> SplitSummary {
-    let mean = |v: Vec<f64>| (!v.is_empty()).then(|| v.iter().sum::<f64>() / v.len() as f64);
     let images: Vec<&ImageScore> = images.iter().filter(|i| i.split == split).collect();
     let masks: Vec<&MaskScore> = masks.iter().filter(|m| m.split == split).collect();
     let mut per_phrase: BTreeMap<String, Vec<f64>> = BTreeMap::new();
@@ -366,12 +373,12 @@ fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> SplitS
     }
 }
 
-/// A camera of the true world in the scene's world: the truth is `s R x + t` of the scene.
+/// Transforms a camera of the true world to the scene's world: truth = `s R x + t` of the scene.
 pub fn to_scene(camera: &Camera, scene_to_truth: &Similarity) -> Camera {
     let Similarity { scale, rotation, translation } = *scene_to_truth;
     let pose = Pose {
         rotation: camera.pose.rotation * rotation,
-        // R_c (s R x + t) + τ, divided by s so that depth is in scene units
+        // R_c (s R x + t) + τ, divided by s so that depth is in scene units.
         translation: (camera.pose.rotation * translation + camera.pose.translation) / scale,
     };
     Camera { pose, ..camera.clone() }

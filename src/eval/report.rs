@@ -1,9 +1,9 @@
-//! What `splatvk eval` reports.
+//! Report of `splatvk eval`.
 use super::{InstanceScore, LengthScore, Split};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// What the figures of the report are.
+/// Definitions of the figures of the report.
 pub(super) const DEFINITIONS: [&str; 11] = [
     "poses: after the similarity that maps the scene's cameras of the train frames onto the true ones",
     "relative_poses: over all pairs of train frames, the angle between the relative rotations and between the directions of \
@@ -61,11 +61,11 @@ pub struct ImageScore {
     pub depth_median_relative: Option<f64>,
     /// Mean of |s z − z_true| / z_true, s from the medians.
     pub depth_abs_rel: Option<f64>,
-    /// Share of pixels whose depth, so scaled, is off by less than 1.25.
+    /// Share of pixels whose depth at that scale has a ratio below 1.25.
     pub depth_delta: Option<f64>,
 }
 
-/// How one phrase did in one frame.
+/// Score of one phrase in one frame.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct MaskScore {
     /// Frame file stem.
@@ -74,11 +74,11 @@ pub struct MaskScore {
     pub split: Split,
     /// Object index in the ground truth.
     pub label: u32,
-    /// Its phrase.
+    /// Phrase of the object.
     pub phrase: String,
     /// Intersection over union of the predicted mask and the object.
     pub iou: f64,
-    /// The most relevant pixel lies on the object.
+    /// Whether the most relevant pixel lies on the object.
     pub localised: bool,
     /// Level that answered, 0 = s.
     pub level: usize,
@@ -132,26 +132,26 @@ pub struct RelativeScore {
     /// Area under the recall curve up to 3 degrees; pairs with a frame that the scene lacks count
     /// as failures.
     pub auc_3: Option<f64>,
-    /// Up to 5 degrees.
+    /// The same area up to 5 degrees.
     pub auc_5: Option<f64>,
-    /// Up to 30 degrees.
+    /// The same area up to 30 degrees.
     pub auc_30: Option<f64>,
 }
 
-/// How far a held-out camera was moved.
+/// Displacement of a refined held-out camera.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct RefinedView {
     /// Frame file stem.
     pub frame: String,
-    /// Whether the moved camera is used.
+    /// Whether the refined camera is used.
     pub kept: bool,
-    /// Turn, degrees.
+    /// Rotation, degrees.
     pub rotation_degrees: f64,
-    /// Shift of the centre over the scene's median depth.
+    /// Displacement of the centre over the scene's median depth.
     pub centre_fraction: f64,
-    /// Focal length that it has over the true one, minus 1.
+    /// Estimated focal length over the true one, minus 1.
     pub focal_relative: f64,
-    /// Principal point that it has minus the true one, pixels.
+    /// Estimated principal point minus the true one, pixels.
     pub centre_shift: [f64; 2],
 }
 
@@ -159,41 +159,41 @@ pub struct RefinedView {
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct RefinedScore {
-    /// What moved.
+    /// Displacement of each camera.
     pub views: Vec<RefinedView>,
-    /// As in the report.
+    /// Image scores, as in the report.
     pub images: Vec<ImageScore>,
-    /// As in the report.
+    /// Mask scores, as in the report.
     pub masks: Vec<MaskScore>,
     /// Means.
     pub summary: SplitSummary,
 }
 
-/// Everything `splatvk eval` reports.
+/// Scores of `splatvk eval`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct EvalReport {
-    /// What each figure is, one line each.
+    /// Definitions of the figures, one line each.
     pub definitions: Vec<String>,
-    /// Per train view.
+    /// Pose errors per train view.
     pub poses: Vec<PoseScore>,
-    /// Per pair of train views.
+    /// Pose errors per pair of train views.
     pub relative_poses: RelativeScore,
-    /// Angle between the scene's up and the true one, degrees; `None` where either is not known.
+    /// Angle between the scene's up and the true one, degrees; `None` if either is unknown.
     pub up_degrees: Option<f64>,
     /// Errors of lengths between surfaces; `None` without true depth.
     pub surface_lengths: Option<LengthScore>,
     /// Errors of lengths between cameras.
     pub camera_lengths: Option<LengthScore>,
-    /// Per rendered frame.
+    /// Scores per rendered frame.
     pub images: Vec<ImageScore>,
-    /// Per object and frame; background labels are not listed.
+    /// Scores per object and frame, without background labels.
     pub masks: Vec<MaskScore>,
-    /// Per phrase the things in space that answer it.
+    /// Instances per phrase.
     pub instances: Vec<InstanceScore>,
     /// Means per split, `train` and `test`.
     pub summary: BTreeMap<String, SplitSummary>,
-    /// Held-out frames from refined cameras, if asked for.
+    /// Held-out frames from refined cameras, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub refined: Option<RefinedScore>,
 }

@@ -5,7 +5,7 @@ fn breakfast() -> GroundTruth {
     GroundTruth::read(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast"))).unwrap()
 }
 
-/// The true train cameras seen from another world: `truth = s R scene + t`.
+/// The true train cameras in another world: `truth = s R scene + t`.
 fn moved() -> (GroundTruth, Vec<Camera>, Similarity) {
     let truth = breakfast();
     let turn = Pose::exp(DVec3::ZERO, DVec3::new(0.4, -0.2, 0.9)).rotation;
@@ -18,7 +18,7 @@ fn moved() -> (GroundTruth, Vec<Camera>, Similarity) {
 }
 
 #[test]
-fn a_perfect_scene_scores_perfectly_and_its_files_say_so() {
+fn evaluation_scores_perfect_scene_perfectly() {
     let (truth, scene, similarity) = moved();
     let dir = tempfile::tempdir().unwrap();
     let mut eval = Evaluation::new(truth.clone(), &scene, Some(dir.path())).unwrap();
@@ -26,11 +26,11 @@ fn a_perfect_scene_scores_perfectly_and_its_files_say_so() {
     for (frame, camera) in
         eval.cameras().into_iter().filter(|(f, _)| f.stem.ends_with("3") || f.stem == "test_05")
     {
-        // the scene camera sees a true point at the same pixel, in scene units
+        // The scene camera projects a true point to the same pixel, at a depth in scene units.
         let point = DVec3::new(0.1, 0.2, 0.05);
         let x = similarity.rotation.transpose() * (point - similarity.translation) / similarity.scale;
         let ((a, za), (b, zb)) = (camera.project(x), frame.camera.project(point));
-        // the file's rotations are orthonormal to f32 rounding only
+        // The file's rotations are orthonormal to f32 rounding only.
         assert!((a - b).length() < 1e-3 && (za * similarity.scale - zb).abs() < 1e-5);
         let mut depth = truth.depth(&frame).unwrap().unwrap();
         depth.data.iter_mut().for_each(|z| *z /= similarity.scale as f32);
@@ -64,7 +64,7 @@ fn a_perfect_scene_scores_perfectly_and_its_files_say_so() {
     let (train, test) = (&report.summary["train"], &report.summary["test"]);
     assert_eq!((train.miou, test.miou, test.localisation), (Some(1.0), Some(1.0), Some(1.0)));
     assert!(train.psnr.unwrap() > 60.0 && train.ssim.unwrap() > 0.999);
-    // f16 depth, divided and multiplied again in f32
+    // f16 depth, divided and multiplied again in f32.
     assert!(train.depth_median_relative.unwrap() < 1e-5);
     assert!(train.depth_abs_rel.unwrap() < 1e-4 && train.depth_delta.unwrap() > 0.999);
     assert!(train.psnr_colour_fit.unwrap() >= train.psnr.unwrap() - 1e-6);
@@ -89,7 +89,7 @@ fn iou_counts_pixels_and_resamples_masks() {
 }
 
 #[test]
-fn another_scenes_truth_is_refused() {
+fn evaluation_refuses_another_scenes_truth() {
     let (truth, mut scene, _) = moved();
     scene.iter_mut().for_each(|c| c.name = format!("x{}", c.name.len()));
     let text = Evaluation::new(truth, &scene, None).err().unwrap().to_string();
@@ -102,18 +102,18 @@ fn another_scenes_truth_is_refused() {
 }
 
 #[test]
-fn held_out_frames_take_the_optics_that_the_scene_found() {
+fn held_out_frames_take_scene_intrinsics() {
     let (truth, mut scene, _) = moved();
     for c in &mut scene {
-        // As a scene at half the size that takes the focal length for a tenth shorter and the
-        // centre for 2 % off.
+        // A scene at half the size whose focal length is a tenth too short and whose principal
+        // point is off by 2 %.
         *c = c.resized(320, 240);
         (c.fx, c.fy, c.cx) = (0.9 * c.fx, 0.9 * c.fy, c.cx + 0.02 * 320.0);
     }
     let eval = Evaluation::new(truth, &scene, None).unwrap();
     let (frame, camera) = eval.cameras().into_iter().find(|(f, _)| f.split == Split::Test).unwrap();
-    let with_optics = eval.with_scene_optics(&camera);
-    assert!((with_optics.fx / frame.camera.fx - 0.9).abs() < 1e-9 && with_optics.pose == camera.pose);
-    assert!((with_optics.cx - frame.camera.cx - 0.02 * 640.0).abs() < 1e-6);
-    assert!((with_optics.cy - frame.camera.cy).abs() < 1e-6);
+    let with_intrinsics = eval.with_scene_intrinsics(&camera);
+    assert!((with_intrinsics.fx / frame.camera.fx - 0.9).abs() < 1e-9 && with_intrinsics.pose == camera.pose);
+    assert!((with_intrinsics.cx - frame.camera.cx - 0.02 * 640.0).abs() < 1e-6);
+    assert!((with_intrinsics.cy - frame.camera.cy).abs() < 1e-6);
 }

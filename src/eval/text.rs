@@ -1,9 +1,9 @@
-//! The report for people.
+//! Text form of the report.
 use super::{EvalReport, SplitSummary};
 use std::fmt::Write;
 
 impl EvalReport {
-    /// A few lines of the figures that matter; the whole is in the JSON.
+    /// The main figures in a few lines; the JSON has all of them.
     pub fn text(&self) -> String {
         let mut out = String::new();
         let worst = |v: &dyn Fn(&super::PoseScore) -> f64| self.poses.iter().map(v).fold(0.0, f64::max);

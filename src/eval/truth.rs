@@ -9,19 +9,19 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Which frames the pipeline may have seen.
+/// Role of a frame for the scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum Split {
-    /// Photos the scene was made from.
+    /// Photos that the scene was made from.
     Train,
-    /// Held out.
+    /// Held-out photos.
     Test,
 }
 
 impl Split {
-    /// As the ground truth spells it.
+    /// Name in the ground truth.
     pub fn name(self) -> &'static str {
         match self {
             Split::Train => "train",
@@ -41,7 +41,7 @@ pub struct TruthFrame {
     pub split: Split,
     /// Intrinsics and pose in the true world.
     pub camera: Camera,
-    /// Radial distortion of the photo, if the set states it; [`TruthFrame::camera`] is without it.
+    /// Radial distortion of the photo, if the set states it; [`TruthFrame::camera`] excludes it.
     pub lens: Option<Lens>,
 }
 
@@ -61,15 +61,15 @@ impl TruthFrame {
 
 /// Labels of frames in another layout than `masks/<stem>.png`.
 pub trait ObjectMaps: std::fmt::Debug + Send + Sync {
-    /// Object index per pixel of a frame, [H, W] of the label's own size; `None` where the frame
-    /// has no labels.
+    /// Object index per pixel of a frame, [H, W] at the label's own size; `None` for a frame
+    /// without labels.
     fn objects(&self, stem: &str) -> Result<Option<Image<u32>>>;
 }
 
 /// A ground-truth folder.
 #[derive(Clone, Debug)]
 pub struct GroundTruth {
-    /// Where it lies.
+    /// Path of the folder.
     pub folder: PathBuf,
     /// Object index → phrase; empty when the set has no labels.
     pub labels: BTreeMap<u32, String>,
@@ -77,7 +77,7 @@ pub struct GroundTruth {
     pub up: Option<DVec3>,
     /// All views.
     pub frames: Vec<TruthFrame>,
-    /// Where labels lie, if not in `masks/<stem>.png`.
+    /// Labels of another layout than `masks/<stem>.png`.
     pub maps: Option<Arc<dyn ObjectMaps>>,
 }
 
@@ -105,33 +105,34 @@ struct FileFrame {
     lens: Option<Lens>,
 }
 
+impl FileFrame {
+    fn read(self, (width, height): (u32, u32)) -> Result<TruthFrame, String> {
+        let FileFrame { file, split, fx, fy, cx, cy, world_to_camera: m, lens } = self;
+        let column = |c: usize| DVec3::new(m[0][c], m[1][c], m[2][c]);
+        let rotation = DMat3::from_cols(column(0), column(1), column(2));
+        let pose = Pose { rotation, translation: column(3) };
+        let camera = Camera { name: file.clone(), width, height, fx, fy, cx, cy, pose };
+        // The matrix stays as written: scores are finer than its printed digits.
+        camera.clone().checked()?;
+        Ok(TruthFrame { stem: stem(&file).to_string(), file, split, camera, lens })
+    }
+}
+
 impl GroundTruth {
     /// Reads `ground_truth.json` of a folder.
     pub fn read(folder: &Path) -> Result<Self> {
         let path = folder.join("ground_truth.json");
         let file: File = files::read_json(&path, "a folder with ground truth has that file")?;
-        let (width, height) = (file.width, file.height);
-        let frame = |f: FileFrame| {
-            let m = f.world_to_camera;
-            let column = |c: usize| DVec3::new(m[0][c], m[1][c], m[2][c]);
-            let rotation = DMat3::from_cols(column(0), column(1), column(2));
-            let stem = stem(&f.file).to_string();
-            let pose = Pose { rotation, translation: column(3) };
-            let camera =
-                Camera { name: f.file.clone(), width, height, fx: f.fx, fy: f.fy, cx: f.cx, cy: f.cy, pose };
-            // The matrix stays as it is written: scores are finer than its printed digits.
-            camera.clone().checked()?;
-            Ok(TruthFrame { file: f.file, stem, split: f.split, camera, lens: f.lens })
-        };
-        let frames = file.frames.into_iter().map(frame).collect::<Result<_, String>>();
+        let size = (file.width, file.height);
+        let frames = file.frames.into_iter().map(|f| f.read(size)).collect::<Result<_, String>>();
         let frames = frames.map_err(|e| Error::input(format!("{}: {e}; correct it", path.display())))?;
         let up = file.up.map(DVec3::normalize_or_zero);
         Ok(GroundTruth { folder: folder.to_path_buf(), labels: file.labels, up, frames, maps: None })
     }
 
-    /// Refuses files that are missing or do not fit the frames, before any work is done with them:
-    /// photos, masks and depth of another size, and with `masks`, where the set has labels, masks
-    /// of some frames only. Says what cannot be scored where it has labels and no mask at all.
+    /// Validates the files before any work: photos, masks and depth at the size of their frames,
+    /// and with `masks`, if the set has labels, a mask for every frame. Returns a warning for
+    /// labels without any mask.
     pub fn check(&self, masks: bool) -> Result<Option<String>> {
         let labelled = self.maps.is_none() && !self.labels.is_empty();
         let mut missing = Vec::new();
@@ -178,8 +179,8 @@ impl GroundTruth {
         Ok(RgbImage { width: image.width() as usize, height: image.height() as usize, data })
     }
 
-    /// Object index per pixel, if the set has masks: of the frame's size where another layout holds
-    /// them.
+    /// Object index per pixel, if the set has masks; masks of another layout are resampled to the
+    /// frame's size.
     pub fn objects(&self, frame: &TruthFrame) -> Result<Option<Image<u32>>> {
         if let Some(maps) = &self.maps {
             let (width, height) = (frame.camera.width as usize, frame.camera.height as usize);
@@ -209,8 +210,8 @@ impl GroundTruth {
         }
     }
 
-    /// Mean over frames of their mean known depth; the largest camera distance from their mean
-    /// where no depth exists.
+    /// Mean over frames of their mean known depth; without depth, the largest distance of a camera
+    /// from their centroid.
     pub fn mean_depth(&self, frames: &[&TruthFrame]) -> Result<f64> {
         let mut means = Vec::new();
         for frame in frames {
@@ -229,14 +230,21 @@ impl GroundTruth {
     }
 }
 
-/// The nearest pixel's value at another size.
+/// Resamples by nearest pixel.
 fn resampled(plane: &Image<u32>, width: usize, height: usize) -> Image<u32> {
     if (plane.width, plane.height) == (width, height) || plane.data.is_empty() {
         return plane.clone();
     }
-    let at = |k: usize, to: usize, from: usize| ((2 * k + 1) * from / (2 * to)).min(from - 1);
-    let pixel = |p: usize| plane.at(at(p % width, width, plane.width), at(p / width, height, plane.height));
+    let pixel = |p: usize| {
+        let (x, y) = (p % width, p / width);
+        plane.at(nearest_index(x, width, plane.width), nearest_index(y, height, plane.height))
+    };
     Image { width, height, data: (0..width * height).map(pixel).collect() }
+}
+
+/// Index along an axis of `from` pixels under the centre of pixel `k` of `to`.
+fn nearest_index(k: usize, to: usize, from: usize) -> usize {
+    ((2 * k + 1) * from / (2 * to)).min(from - 1)
 }
 
 fn open(path: &Path) -> Result<image::DynamicImage> {

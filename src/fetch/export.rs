@@ -1,5 +1,5 @@
-//! Networks that no public ONNX file holds: their checkpoint is exported by a script of
-//! `tools/export`, which this program carries, in a Python environment that exists only meanwhile.
+//! Export of networks without a public ONNX file: a script of `tools/export`, included in this
+//! program, exports their checkpoint in a temporary Python environment.
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -33,7 +33,7 @@ const SCRIPTS: [(&str, &str); 12] = scripts![
     "export_vggt.py"
 ];
 
-/// The folders of an export below the one of its work.
+/// Folders of an export below its work folder.
 struct Places {
     work: PathBuf,
     environment: PathBuf,
@@ -54,20 +54,19 @@ impl Places {
     }
 }
 
-/// One command of an export: what it is for, and its words.
+/// One command of an export.
 struct Step {
     name: &'static str,
     words: Vec<String>,
 }
 
-/// The commands of an export as a shell would take them, in order; what `--dry-run` shows.
+/// Commands of an export as a shell would take them, in order, for `--dry-run`.
 pub fn commands(recipe: &Recipe, work: &Path, out: &Path) -> Vec<String> {
     steps(recipe, &Places::of(work, out)).into_iter().map(|s| s.words.join(" ")).collect()
 }
 
-fn steps(recipe: &Recipe, at: &Places) -> Vec<Step> {
-    let text = |p: &Path| p.display().to_string();
-    let python = text(&at.environment.join("bin/python"));
+fn steps(recipe: &Recipe, places: &Places) -> Vec<Step> {
+    let python = text(&places.environment.join("bin/python"));
     let pip = |more: &[&str], packages: &[&String]| {
         let fixed = [python.as_str(), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"];
         fixed
@@ -77,9 +76,8 @@ fn steps(recipe: &Recipe, at: &Places) -> Vec<Step> {
             .chain(packages.iter().map(|p| p.to_string()))
             .collect()
     };
-    let words = |list: &[&str]| list.iter().map(|w| w.to_string()).collect::<Vec<_>>();
-    let mut steps =
-        vec![Step { name: "environment", words: words(&["python3", "-m", "venv", &text(&at.environment)]) }];
+    let environment = ["python3", "-m", "venv", &text(&places.environment)];
+    let mut steps = vec![Step { name: "environment", words: owned(&environment) }];
     let packages: Vec<&String> = common_packages().iter().chain(&recipe.packages).collect();
     steps.push(Step { name: "packages", words: pip(&[], &packages) });
     if !recipe.bare_packages.is_empty() {
@@ -89,15 +87,23 @@ fn steps(recipe: &Recipe, at: &Places) -> Vec<Step> {
     if let Some(code) = &recipe.code {
         let flags =
             ["git", "clone", "--quiet", "--depth", "1", "--recurse-submodules", "--shallow-submodules"];
-        let mut clone = words(&flags);
-        clone.extend([code.clone(), text(&at.code)]);
+        let mut clone = owned(&flags);
+        clone.extend([code.clone(), text(&places.code)]);
         steps.push(Step { name: "code", words: clone });
     }
-    let mut export = vec![python, text(&at.scripts.join(&recipe.script))];
+    let mut export = vec![python, text(&places.scripts.join(&recipe.script))];
     export.extend(recipe.arguments.iter().cloned());
-    export.extend(["--out".to_owned(), text(&at.out)]);
+    export.extend(["--out".to_owned(), text(&places.out)]);
     steps.push(Step { name: "export", words: export });
     steps
+}
+
+fn text(path: &Path) -> String {
+    path.display().to_string()
+}
+
+fn owned(words: &[&str]) -> Vec<String> {
+    words.iter().map(|w| w.to_string()).collect()
 }
 
 /// Downloads the checkpoints and writes the model's files with them.
@@ -108,50 +114,50 @@ pub(super) fn export(
     client: &Client,
     progress: &dyn Progress,
 ) -> Result<Vec<Fetched>> {
-    let at = Places::of(&staging.work(), &staging.model());
+    let places = Places::of(&staging.work(), &staging.model());
     let mut weights = Vec::new();
     for source in &recipe.weights {
-        let to = at.work.join(&source.name);
-        weights.push(client.download(source, entry.ceiling(), &at.work, &to, progress)?);
+        let to = places.work.join(&source.name);
+        weights.push(client.download(source, entry.ceiling(), &places.work, &to, progress)?);
     }
-    // What a killed export left: cheap to make again next to finding out whether it is whole.
+    // A killed export is made again: cheaper than to verify whether it is complete.
     staging.clear_model()?;
-    remove(&at)?;
-    let done = make(recipe, &at, progress);
-    let removed = remove(&at);
+    remove(&places)?;
+    let done = make(recipe, &places, progress);
+    let removed = remove(&places);
     done.and(removed).map(|()| weights)
 }
 
-fn make(recipe: &Recipe, at: &Places, progress: &dyn Progress) -> Result<()> {
-    std::fs::create_dir_all(&at.scripts).map_err(Error::unwritable(&at.scripts))?;
+fn make(recipe: &Recipe, places: &Places, progress: &dyn Progress) -> Result<()> {
+    std::fs::create_dir_all(&places.scripts).map_err(Error::unwritable(&places.scripts))?;
     for (name, text) in SCRIPTS {
-        let path = at.scripts.join(name);
+        let path = places.scripts.join(name);
         std::fs::write(&path, text).map_err(Error::unwritable(&path))?;
     }
-    for step in steps(recipe, at) {
+    for step in steps(recipe, places) {
         progress.begin(step.name, 1);
-        run(&step, at, progress)?;
+        run(&step, places, progress)?;
         progress.step(1, "");
         progress.end();
     }
     Ok(())
 }
 
-/// Environment, scripts and code; checkpoints stay until the model is installed.
-fn remove(at: &Places) -> Result<()> {
-    for folder in [&at.environment, &at.scripts, &at.code].into_iter().filter(|f| f.exists()) {
+/// Removes environment, scripts and code; checkpoints stay until the model is installed.
+fn remove(places: &Places) -> Result<()> {
+    for folder in [&places.environment, &places.scripts, &places.code].into_iter().filter(|f| f.exists()) {
         std::fs::remove_dir_all(folder).map_err(Error::io(folder))?;
     }
     Ok(())
 }
 
-fn run(step: &Step, at: &Places, progress: &dyn Progress) -> Result<()> {
+fn run(step: &Step, places: &Places, progress: &dyn Progress) -> Result<()> {
     let Some((program, arguments)) = step.words.split_first() else { return Ok(()) };
     let mut child = Command::new(program)
         .args(arguments)
         // Checkpoints are named without their folder.
-        .current_dir(&at.work)
-        .env("PYTHONPATH", &at.code)
+        .current_dir(&places.work)
+        .env("PYTHONPATH", &places.code)
         .env("PYTHONWARNINGS", "ignore")
         .stdin(Stdio::null())
         .stdout(Stdio::null())
@@ -163,7 +169,7 @@ fn run(step: &Step, at: &Places, progress: &dyn Progress) -> Result<()> {
                 words(&e)
             ))
         })?;
-    // Read on a thread of its own, or a full pipe would stop the child.
+    // A separate thread reads, because a full pipe would block the child.
     let pipe = child.stderr.take();
     let reader = std::thread::spawn(move || {
         let mut text = Vec::new();
@@ -177,14 +183,14 @@ fn run(step: &Step, at: &Places, progress: &dyn Progress) -> Result<()> {
         }
         match child.try_wait().map_err(Error::io(program))? {
             Some(status) => break status,
-            // Commands of minutes; Ctrl-C should seem to act at once.
+            // Commands take minutes; Ctrl-C is to act at once.
             None => std::thread::sleep(Duration::from_millis(100)),
         }
     };
-    let said = reader.join().unwrap_or_default();
+    let errors = reader.join().unwrap_or_default();
     if status.success() {
         return Ok(());
     }
-    let last = said.lines().rev().find(|l| !l.trim().is_empty()).unwrap_or("it says nothing");
+    let last = errors.lines().rev().find(|l| !l.trim().is_empty()).unwrap_or("it says nothing");
     Err(Error::work(format!("{}: {} failed: {}", step.name, step.words.join(" "), last.trim())))
 }

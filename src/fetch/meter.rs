@@ -1,17 +1,17 @@
-//! How far a download is, in the words of [`Progress`].
+//! Progress of a download.
 use std::time::{Duration, Instant};
 
 use crate::infer::catalogue::Source;
 use crate::progress::Progress;
 
-/// Between two reports: a bar moves smoothly, a log stays short.
+/// Time between two reports: a bar moves smoothly, a log stays short.
 const INTERVAL: Duration = Duration::from_millis(200);
 
-/// Reports in megabytes.
+/// Reports a download in megabytes.
 pub(super) struct Meter<'a> {
     pub progress: &'a dyn Progress,
     name: &'a str,
-    began: Instant,
+    started: Instant,
     reported: Instant,
     start: u64,
     total: Option<u64>,
@@ -20,17 +20,18 @@ pub(super) struct Meter<'a> {
 impl<'a> Meter<'a> {
     pub fn new(source: &'a Source, progress: &'a dyn Progress) -> Self {
         let now = Instant::now();
-        Meter { progress, name: &source.name, began: now, reported: now, start: 0, total: None }
+        Meter { progress, name: &source.name, started: now, reported: now, start: 0, total: None }
     }
 
-    /// `start` bytes are there already.
+    /// Begins a report with `start` bytes already present.
     pub fn begin(&mut self, start: u64, total: Option<u64>) {
-        (self.start, self.total, self.began, self.reported) = (start, total, Instant::now(), Instant::now());
+        (self.start, self.total, self.started, self.reported) =
+            (start, total, Instant::now(), Instant::now());
         self.progress.begin("download", megabytes(total.unwrap_or(0)));
         self.report(start);
     }
 
-    /// `done` bytes are there now.
+    /// Reports `done` bytes in total.
     pub fn step(&mut self, done: u64) {
         if self.reported.elapsed() >= INTERVAL || Some(done) == self.total {
             self.reported = Instant::now();
@@ -44,7 +45,7 @@ impl<'a> Meter<'a> {
 
     fn report(&self, done: u64) {
         let of = self.total.map(|t| format!(" of {:.1}", t as f64 / 1e6)).unwrap_or_default();
-        let seconds = self.began.elapsed().as_secs_f64().max(1e-3);
+        let seconds = self.started.elapsed().as_secs_f64().max(1e-3);
         let speed = (done - self.start) as f64 / 1e6 / seconds;
         let note = format!("{} {:.1}{of} MB, {speed:.1} MB/s", self.name, done as f64 / 1e6);
         self.progress.step(megabytes(done), &note);

@@ -1,6 +1,6 @@
-//! Gets networks: public ONNX files over HTTP, or the export of a checkpoint, into a hidden folder;
-//! there they are held to their contract and to a numeric self-check, and appear whole in their
-//! place or not at all. See docs/use/models.md#fetching.
+//! Installation of networks: public ONNX files over HTTP, or the export of a checkpoint, into a
+//! hidden folder. There they must pass their contract and a numeric self-check; then they appear
+//! complete in their place, else not at all. See docs/use/models.md#fetching.
 mod download;
 mod export;
 mod meter;
@@ -23,35 +23,35 @@ use crate::progress::Progress;
 use crate::{Error, Result, files};
 use staging::Staging;
 
-/// The names of the packs.
+/// Names of the packs.
 pub const PACKS: [&str; 2] = ["open", "paper"];
 
-/// A model that was fetched.
+/// A fetched model.
 #[derive(Clone, Debug, serde::Serialize)]
 pub struct Report {
-    /// Its name.
+    /// Name of the model.
     pub id: String,
-    /// Where it lies.
+    /// Folder of the model.
     pub folder: PathBuf,
-    /// The files that came over the network.
+    /// Downloaded files.
     pub files: Vec<Fetched>,
-    /// What the self-check did.
+    /// Steps of the self-check.
     pub steps: Vec<Measured>,
 }
 
-/// What there is of a model before it is fetched.
+/// State of a model before it is fetched.
 #[derive(Clone, Debug, PartialEq, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Present {
-    /// Nothing.
+    /// No folder.
     Absent,
-    /// A folder, whose files are what its adapter pins, if it pins any.
+    /// A folder whose files match the checksums of its adapter, if it pins any.
     Sound,
-    /// A folder in which a file is not what was pinned; one line that says which.
+    /// A folder with a file that differs from its pinned checksum; one line names it.
     Changed(String),
 }
 
-/// The models that packs and names stand for, each once, in the order of the catalogue.
+/// Models of packs and names, each once, in the order of the catalogue.
 pub fn chosen(names: &[String]) -> Result<Vec<&'static CatalogueEntry>> {
     for name in names {
         let known = PACKS.contains(&name.as_str()) || catalogue().iter().any(|k| k.id == *name);
@@ -60,18 +60,18 @@ pub fn chosen(names: &[String]) -> Result<Vec<&'static CatalogueEntry>> {
             return Err(Error::input(format!("{name}: no such model or pack; there are {}", all.join(", "))));
         }
     }
-    let wanted = |k: &&CatalogueEntry| names.iter().any(|n| k.id == *n || k.packs.contains(n));
-    let some: Vec<_> = catalogue().iter().filter(wanted).collect();
-    match some.iter().find(|k| sources(k).is_empty()) {
+    let is_named = |k: &&CatalogueEntry| names.iter().any(|n| k.id == *n || k.packs.contains(n));
+    let models: Vec<_> = catalogue().iter().filter(is_named).collect();
+    match models.iter().find(|k| sources(k).is_empty()) {
         Some(k) => Err(Error::input(format!(
             "{}: no public source is known; export it yourself ({}, {})",
             k.id, k.source, k.export
         ))),
-        None => Ok(some),
+        None => Ok(models),
     }
 }
 
-/// Everything that is downloaded for a model: its ONNX files, or the checkpoints that are exported.
+/// Downloads of a model: its ONNX files, or the checkpoints for its export.
 pub fn sources(entry: &CatalogueEntry) -> &[Source] {
     match &entry.recipe {
         Some(recipe) if entry.files.is_empty() => &recipe.weights,
@@ -79,42 +79,42 @@ pub fn sources(entry: &CatalogueEntry) -> &[Source] {
     }
 }
 
-/// The export that a model needs.
+/// Export recipe of a model without public ONNX files.
 pub fn recipe(entry: &CatalogueEntry) -> Option<&Recipe> {
     entry.recipe.as_ref().filter(|_| entry.files.is_empty())
 }
 
-/// The folder in which a model is put together before it appears in `folder`.
+/// Folder in which a model for `folder` is put together.
 pub fn work_folder(folder: &Path, id: &str) -> PathBuf {
     staging::root(folder, id).join("work")
 }
 
-/// Looks at a model in its folder and compares its files with what was pinned when it came.
+/// Compares the files of an installed model with the checksums pinned at its installation.
 pub fn present(entry: &CatalogueEntry, folder: &Path) -> Result<Present> {
     let place = folder.join(&entry.id);
     if place.symlink_metadata().is_err() {
         return Ok(Present::Absent);
     }
-    for (name, wanted) in pinned(&place)?.sha256 {
+    for (name, expected) in pinned(&place)?.sha256 {
         let file = place.join(&name);
         let found = files::content_hash(&file).unwrap_or_else(|e| format!("unreadable, {e}"));
-        if found != wanted {
-            let text = format!("{}: has sha256 {found}, {wanted} was pinned", file.display());
+        if found != expected {
+            let text = format!("{}: has sha256 {found}, {expected} was pinned", file.display());
             return Ok(Present::Changed(text));
         }
     }
     Ok(Present::Sound)
 }
 
-/// Removes what interrupted fetches left of models that are installed by now, and puts back a model
-/// that one had taken out to replace it; not of those in `for_continuation`, which are fetched next.
-pub fn tidy(folder: &Path, for_continuation: &[&str]) -> Result<()> {
+/// Restores models that interrupted fetches had moved aside, and removes their leftovers for
+/// installed models, except those in `requested`, which are fetched next.
+pub fn tidy(folder: &Path, requested: &[&str]) -> Result<()> {
     for (root, _) in leftovers(folder) {
         let name = staging::name(&root).unwrap_or_default();
         if let Found::Left(held) = look(&root) {
             held.put_back();
         }
-        if !for_continuation.contains(&name.as_str()) && folder.join(&name).exists() {
+        if !requested.contains(&name.as_str()) && folder.join(&name).exists() {
             remove_leftover(&root).map_err(Error::io(&root))?;
         }
     }
@@ -125,7 +125,7 @@ fn pinned(place: &Path) -> Result<Adapter> {
     Adapter::of_file(&place.join("any.onnx"))
 }
 
-/// Fetches one model into `folder`, in the place of one that is there.
+/// Fetches one model into `folder`; replaces an installed one.
 pub fn fetch(
     entry: &CatalogueEntry,
     registry: &Registry,
@@ -139,8 +139,7 @@ pub fn fetch(
         None => download_files(entry, &staging, folder, client, progress)?,
     };
     progress.begin("check", 1);
-    // What only this download says that it is right, and is not, must not be taken for it the next
-    // time.
+    // A wrong file that only this download pins must not be trusted next time.
     let steps = verify(entry, registry, &staging).inspect_err(|_| staging.discard(unpinned(entry)))?;
     progress.step(1, "");
     progress.end();
@@ -166,13 +165,13 @@ fn download_files(
     Ok(files)
 }
 
-/// The files of which the catalogue does not know the content.
+/// Files without a checksum in the catalogue.
 fn unpinned(entry: &CatalogueEntry) -> impl Iterator<Item = &str> {
     entry.files.iter().filter(|s| s.sha256.is_none()).map(|s| s.name.as_str())
 }
 
-/// The first download of a file whose content the catalogue does not know decides what it is:
-/// another one from the same address is refused.
+/// Refuses a file that differs from the first download of the same address, if the catalogue has no
+/// checksum of it.
 fn same_as_before(files: &[Fetched], place: &Path) -> Result<()> {
     let Adapter { sha256, source, .. } = pinned(place)?;
     for file in files.iter().filter(|f| source.get(&f.name) == Some(&f.from)) {
@@ -189,30 +188,29 @@ fn same_as_before(files: &[Fetched], place: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The adapter of downloaded files: their family, what they hash to and where they are from.
+/// Adapter of downloaded files: family, checksums and addresses.
 fn adapter(entry: &CatalogueEntry, files: &[Fetched]) -> String {
-    let table = |of: fn(&Fetched) -> &String| {
-        files.iter().map(|f| (f.name.clone(), of(f).clone())).collect::<BTreeMap<_, _>>()
-    };
-    let lines = |map: BTreeMap<String, String>| {
-        map.into_iter().map(|(name, value)| format!("{name:?} = {value:?}\n")).collect::<String>()
-    };
     format!(
         "# Written by splatvk models fetch.\nfamily = {:?}\n\n[sha256]\n{}\n[source]\n{}",
         entry.family,
-        lines(table(|f| &f.sha256)),
-        lines(table(|f| &f.from))
+        toml_table(files, |f| &f.sha256),
+        toml_table(files, |f| &f.from)
     )
 }
 
-/// Holds what came to the contract of its kind and repeats references and the built-in pictures
-/// with it.
+/// Lines of a TOML table from file name to value, ordered by name.
+fn toml_table(files: &[Fetched], value: fn(&Fetched) -> &String) -> String {
+    let rows: BTreeMap<&String, &String> = files.iter().map(|f| (&f.name, value(f))).collect();
+    rows.into_iter().map(|(name, value)| format!("{name:?} = {value:?}\n")).collect()
+}
+
+/// Verifies the model against the contract of its kind, its references and the built-in images.
 fn verify(entry: &CatalogueEntry, registry: &Registry, staging: &Staging) -> Result<Vec<Measured>> {
-    let useless = |why: &str| {
+    let unusable = |reason: &str| {
         Error::missing_model(
             &entry.id,
             format!(
-                "{}: what came is not a model that splatvk can use, nothing was installed: {why}",
+                "{}: what came is not a model that splatvk can use, nothing was installed: {reason}",
                 entry.id
             ),
         )
@@ -220,12 +218,12 @@ fn verify(entry: &CatalogueEntry, registry: &Registry, staging: &Staging) -> Res
     let found = inventory(&registry.only(staging.root()).uncached());
     let model = found.models.iter().find(|m| m.name == entry.id && m.tasks.contains(&entry.task));
     let Some(model) = model else {
-        let why = found.broken.first().map_or("no part of it is recognised", |b| &b.reason);
-        return Err(useless(why));
+        let reason = found.broken.first().map_or("no part of it is recognised", |b| &b.reason);
+        return Err(unusable(reason));
     };
     match check(model) {
         Err(Error::Cancelled) => Err(Error::Cancelled),
-        Err(e) => Err(useless(&e.to_string())),
+        Err(e) => Err(unusable(&e.to_string())),
         Ok(steps) => Ok(steps),
     }
 }

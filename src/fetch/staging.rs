@@ -1,16 +1,15 @@
-//! Where a model is put together: a hidden folder beside its place, which no search for models
-//! looks into. It outlives a killed process, so that the next fetch goes on from it; one process at
-//! a time holds it.
+//! Staging of a model: a hidden folder beside its place that searches for models skip. It survives
+//! a killed process, so that the next fetch resumes; one process at a time holds it.
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use crate::files::{Found, Held, look, swap};
 use crate::{Error, Result};
 
-/// What the names of such folders begin with.
+/// Prefix of the names of these folders.
 const PREFIX: &str = ".fetch-";
 
-/// The folder in which one model comes into being.
+/// Staging folder of one model.
 pub(super) struct Staging {
     held: Held,
     place: PathBuf,
@@ -18,7 +17,8 @@ pub(super) struct Staging {
 }
 
 impl Staging {
-    /// That of model `name` in a model folder, as an earlier process left it.
+    /// Opens the staging folder of model `name` in a model folder, with the leftovers of an earlier
+    /// process.
     pub fn open(folder: &Path, name: &str) -> Result<Staging> {
         let root = root(folder, name);
         std::fs::create_dir_all(folder).map_err(Error::unwritable(folder))?;
@@ -36,17 +36,17 @@ impl Staging {
         self.held.folder()
     }
 
-    /// The model's folder to be.
+    /// Folder of the new model.
     pub fn model(&self) -> PathBuf {
         self.root().join(&self.name)
     }
 
-    /// For partial files, checkpoints and what exports need.
+    /// Folder of partial files, checkpoints and exports.
     pub fn work(&self) -> PathBuf {
         self.root().join("work")
     }
 
-    /// Starts the model's folder afresh.
+    /// Empties the model's folder.
     pub fn clear_model(&self) -> Result<()> {
         let model = self.model();
         std::fs::remove_dir_all(&model)
@@ -56,19 +56,19 @@ impl Staging {
 
     /// Removes some files of the model.
     pub fn discard<'a>(&self, files: impl Iterator<Item = &'a str>) {
-        // Reached on the way out of an error, which is the one to report.
+        // Called on an error, which is the one to report.
         files.for_each(|name| drop(std::fs::remove_file(self.model().join(name))));
     }
 
-    /// Moves the model to its place. One that is there is only removed after that, and comes back
-    /// if the move fails.
+    /// Moves the model to its place. An old one is removed only afterwards, and restored if the
+    /// move fails.
     pub fn install(self) -> Result<PathBuf> {
         let moved = match self.place.symlink_metadata() {
             Ok(_) => swap(&self.model(), &self.place, &self.held.aside()),
             Err(_) => std::fs::rename(self.model(), &self.place),
         };
         moved.map_err(Error::io(&self.place))?;
-        // The move must be on disk before what it replaces goes.
+        // The move must be on disk before the old model is removed.
         if let Some(folder) = self.place.parent() {
             let _ = File::open(folder).and_then(|f| f.sync_all());
         }
@@ -78,17 +78,16 @@ impl Staging {
     }
 }
 
-/// The hidden folder of a model.
+/// Staging folder of a model.
 pub(super) fn root(folder: &Path, name: &str) -> PathBuf {
     folder.join(format!("{PREFIX}{name}"))
 }
 
-/// What interrupted fetches left in a model folder: each hidden folder whose owner is gone, with
-/// its bytes.
+/// Staging folders in a model folder whose process is gone, with their sizes in bytes.
 pub fn leftovers(folder: &Path) -> Vec<(PathBuf, u64)> {
     let list = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|e| e.path());
-    let left = |p: &PathBuf| name(p).is_some() && matches!(look(p), Found::Left(_) | Found::Blank(_));
-    let mut all: Vec<PathBuf> = list.filter(left).collect();
+    let is_leftover = |p: &PathBuf| name(p).is_some() && matches!(look(p), Found::Left(_) | Found::Blank(_));
+    let mut all: Vec<PathBuf> = list.filter(is_leftover).collect();
     all.sort();
     all.into_iter()
         .map(|root| {
@@ -98,7 +97,7 @@ pub fn leftovers(folder: &Path) -> Vec<(PathBuf, u64)> {
         .collect()
 }
 
-/// The model whose hidden folder this is.
+/// Name of the model of a staging folder.
 pub(super) fn name(root: &Path) -> Option<String> {
     root.file_name()?.to_str()?.strip_prefix(PREFIX).filter(|n| !n.is_empty()).map(str::to_owned)
 }

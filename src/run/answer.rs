@@ -1,5 +1,5 @@
-//! The answer of a scene to one text: whether it is there, how many of it and where, and what every
-//! view shows of it.
+//! The answer of a scene to one text: presence, instances with their positions, and the result in
+//! every view.
 use super::view::DecodedFrame;
 use crate::Result;
 use crate::query::highlight::{Highlight, highlight};
@@ -10,49 +10,48 @@ use crate::query::select::{Selection, select};
 use crate::query::{self, QueryOptions, QueryResult, TextQuery};
 use crate::report::viewer::ShownAnswer;
 use crate::scene::{Camera, Image, LanguageField, Splats, World};
-use glam::DVec3;
 use serde_json::{Value, json};
 
-/// What all answers of a scene need, prepared once.
+/// Query data of a scene, prepared once.
 pub struct Prepared {
-    /// Of its splats.
+    /// Positions of the splats.
     places: Places,
-    /// What its own photos' cameras show.
+    /// Codes that the photos' cameras show.
     pub(super) shown: ShownPixels,
 }
 
-/// The answers to one text, one per view.
+/// The answers to one text: of the scene, and one per view.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct Answers {
     /// The text of the query.
     pub text: String,
-    /// What is understood of it.
+    /// The understood part of the text.
     pub reading: Reading,
-    /// Per view. Where it is not found, the mask is empty; relevancy and location are those of what
-    /// is nearest.
+    /// Result per view. Without a find the mask is empty; relevancy and location are those of the
+    /// nearest code.
     pub views: Vec<QueryResult>,
-    /// Whether the scene has what the text means; `None` where the text model knows too few texts
-    /// to tell.
+    /// Whether the scene contains the subject of the text; `None` if the text model has too few
+    /// texts to decide.
     pub presence: Option<Presence>,
-    /// Share of other things that fit the scene at least as well, in (0, 1]; `None` as before.
+    /// Share of other things that fit the scene at least as well, in (0, 1]; `None` like
+    /// `presence`.
     pub p_value: Option<f32>,
-    /// How far the photos agree on what answers, 0 to 1 (docs/internals/method.md#reliability): of
-    /// all of it, and per view of what it shows of it. `None` where that is not known, or nothing
-    /// answers.
+    /// Agreement of the photos on the answer, 0 to 1 (docs/internals/method.md#reliability). `None`
+    /// if it is unknown, or if there is no answer.
     pub reliability: Option<f64>,
-    /// See `reliability`.
+    /// `reliability` of the part that each view shows.
     pub view_reliability: Vec<Option<f64>>,
-    /// The splats that the text means, whatever the views; none where it is absent.
+    /// Splats of the answer, independent of the views; none for an absent text.
     pub selection: Selection,
-    /// The things that the text means, largest first; none where it is absent.
+    /// Things of the answer, largest first; none for an absent text.
     pub instances: Vec<Instance>,
-    /// For the scene as a whole.
+    /// Highlighting in the scene as a whole.
     pub highlight: Highlight,
 }
 
 impl Answers {
-    /// For the interactive view.
+    /// The answer for the interactive view.
     pub fn shown(&self) -> ShownAnswer<'_> {
         ShownAnswer {
             text: &self.text,
@@ -64,7 +63,7 @@ impl Answers {
         }
     }
 
-    /// Views in which the text was found.
+    /// Number of views in which the text was found.
     pub fn found(&self) -> usize {
         self.views.iter().filter(|v| v.found).count()
     }
@@ -74,13 +73,13 @@ impl Answers {
         verdict(self.presence, self.found(), self.views.len())
     }
 
-    /// The same, with what is not understood of the text.
+    /// The verdict, with the parts of the text that are not understood.
     pub fn sentence(&self) -> String {
         std::iter::once(self.verdict()).chain(self.reading.notes()).collect::<Vec<_>>().join("; ")
     }
 
-    /// What is known of the text and of its instances, as `query --json` and run.json have it;
-    /// `views` are names of the views.
+    /// Record of the text and its instances, as in `query --json` and run.json; `views` are the
+    /// names of the views.
     pub fn record(&self, views: &[String], world: &World) -> Value {
         let metres = world.scale.as_ref().map(|s| s.metres_per_unit);
         let instances: Vec<Value> = self.instances.iter().map(|i| instance_json(i, views, metres)).collect();
@@ -92,26 +91,28 @@ impl Answers {
 }
 
 fn instance_json(i: &Instance, views: &[String], metres_per_unit: Option<f64>) -> Value {
-    let points = |list: &[DVec3], unit: f64| list.iter().map(|p| (*p * unit).to_array()).collect::<Vec<_>>();
-    let place = |unit: f64| {
-        let box_of = &i.oriented;
-        json!({
-            "centre": (i.centre * unit).to_array(),
-            "box": { "min": (i.bounds[0] * unit).to_array(), "max": (i.bounds[1] * unit).to_array() },
-            "oriented_box": {
-                "centre": (box_of.centre * unit).to_array(), "axes": points(&box_of.axes, 1.0), "size": (box_of.size * unit).to_array(),
-            },
-        })
-    };
     let pixels: serde_json::Map<String, Value> =
         views.iter().zip(&i.pixels).map(|(name, pixel)| (name.clone(), json!(pixel))).collect();
-    let mut entry = place(1.0);
-    entry["metres"] = metres_per_unit.map_or(Value::Null, place);
+    let mut entry = placement_json(i, 1.0);
+    entry["metres"] = metres_per_unit.map_or(Value::Null, |unit| placement_json(i, unit));
     entry["splats"] = i.splats.len().into();
     entry["share"] = i.share.into();
     entry["reliability"] = json!(i.reliability);
     entry["pixels"] = pixels.into();
     entry
+}
+
+/// Centre and boxes of an instance in units of `1 / unit` scene units.
+fn placement_json(i: &Instance, unit: f64) -> Value {
+    let oriented = &i.oriented;
+    let axes: Vec<_> = oriented.axes.iter().map(|axis| axis.to_array()).collect();
+    json!({
+        "centre": (i.centre * unit).to_array(),
+        "box": { "min": (i.bounds[0] * unit).to_array(), "max": (i.bounds[1] * unit).to_array() },
+        "oriented_box": {
+            "centre": (oriented.centre * unit).to_array(), "axes": axes, "size": (oriented.size * unit).to_array(),
+        },
+    })
 }
 
 /// An answer in a few words: "found in 3 of 4 photos".
@@ -124,19 +125,19 @@ pub fn verdict(presence: Option<Presence>, found: usize, views: usize) -> String
 }
 
 impl Prepared {
-    /// Of a scene and what its own cameras show.
+    /// Prepares a scene with the codes that its own cameras show.
     pub fn new(splats: &Splats, field: &LanguageField, shown: ShownPixels) -> Prepared {
         Prepared { places: Places::of(splats, field), shown }
     }
 
-    /// Of a scene whose own views are these.
+    /// Prepares a scene with the frames of its own cameras.
     pub fn of_frames(splats: &Splats, field: &LanguageField, frames: &[DecodedFrame]) -> Prepared {
         let codes: Vec<&[Image<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
         Prepared::new(splats, field, ShownPixels::of(field, &codes))
     }
 
-    /// What speaks for a text; `background` is the place of how well the other things of its form
-    /// fit this scene.
+    /// Evidence for the presence of a text; `background` caches the fit of the other things of its
+    /// form to this scene.
     fn evidence(
         &self,
         field: &LanguageField,
@@ -149,7 +150,7 @@ impl Prepared {
         evidence.map(|e| if query.reading.is_doubtful() { e.in_doubt() } else { e })
     }
 
-    /// The splats that a text means; none where it is absent.
+    /// Splats of the answer to a text; none if it is absent.
     fn select(
         &self,
         field: &LanguageField,
@@ -157,15 +158,15 @@ impl Prepared {
         presence: Option<Presence>,
         options: &QueryOptions,
     ) -> Result<Selection> {
-        let mut chosen = select(field, &self.places, query, options)?;
+        let mut selection = select(field, &self.places, query, options)?;
         if presence == Some(Presence::Absent) {
-            chosen.splats.clear();
-            chosen.found = false;
+            selection.splats.clear();
+            selection.found = false;
         }
-        Ok(chosen)
+        Ok(selection)
     }
 
-    /// The answer in these views, which need not be the scene's own.
+    /// Answers a text in views, which need not be the scene's own.
     pub fn answer(
         &self,
         field: &LanguageField,
@@ -175,7 +176,7 @@ impl Prepared {
         background: &mut Option<Background>,
     ) -> Result<Answers> {
         let evidence = self.evidence(field, query, background);
-        // A model that cannot tell what is there cannot tell that an unclear text is, either.
+        // Without evidence an unclear text is unsure.
         let doubt = query.reading.is_doubtful().then_some(Presence::Unsure);
         let presence = evidence.map(|e| e.presence).or(doubt);
         let codes: Vec<&[Image<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
@@ -189,15 +190,15 @@ impl Prepared {
             false => Vec::new(),
         };
         for instance in &mut instances {
-            let seen = cameras.iter().zip(frames);
-            let pixels = seen.map(|(c, f)| self.places.pixel(instance, c, &f.rendered.depth));
+            let views = cameras.iter().zip(frames);
+            let pixels = views.map(|(c, f)| self.places.pixel(instance, c, &f.rendered.depth));
             instance.pixels = pixels.collect();
         }
-        let seen_in = |(camera, frame): (&Camera, &DecodedFrame)| {
-            let seen = self.places.seen_of(&selection.splats, camera, &frame.rendered.depth);
-            self.places.reliability(&seen, selection.level)
+        let reliability_in = |(camera, frame): (&Camera, &DecodedFrame)| {
+            let visible = self.places.seen_of(&selection.splats, camera, &frame.rendered.depth);
+            self.places.reliability(&visible, selection.level)
         };
-        let view_reliability = cameras.iter().zip(frames).map(seen_in).collect();
+        let view_reliability = cameras.iter().zip(frames).map(reliability_in).collect();
         let highlight = highlight(&codes, field, query, &views)?;
         Ok(Answers {
             text: query.text.clone(),
@@ -223,15 +224,16 @@ mod tests {
     use crate::query::phrasing::{Phrasing, Vocabulary};
     use crate::query::presence::Alternatives;
     use crate::scene::{Codebook, LevelField, Pose, Scale};
+    use glam::DVec3;
     use splatvk_test_support::embedding::{self, text_embedding};
     use std::sync::Arc;
 
-    /// Edge of the square pictures, pixels.
+    /// Side of the square images, pixels.
     const SIZE: usize = 100;
 
-    /// A wall of splats one unit before the camera, as wide as its picture, with two balls and a
-    /// lemon in it: pixel → phrase.
-    fn shown(x: usize, y: usize) -> usize {
+    /// Phrase index at a pixel of a wall of splats one unit in front of the camera, as wide as its
+    /// image, with two balls and a lemon in it.
+    fn phrase_at(x: usize, y: usize) -> usize {
         let within = |cx: i32, cy: i32| (x as i32 - cx).abs() <= 8 && (y as i32 - cy).abs() <= 8;
         match (within(20, 50) || within(80, 50), within(50, 80)) {
             (true, _) => 1,
@@ -270,15 +272,18 @@ mod tests {
             codes: (0..3).flat_map(unit).collect(),
             ..Codebook::default()
         };
-        let features = pixels().flat_map(|(x, y)| unit(shown(x, y))).collect();
-        let reliability = pixels().map(|(x, y)| if shown(x, y) == 2 { 0.25 } else { 0.5 }).collect();
+        let features = pixels().flat_map(|(x, y)| unit(phrase_at(x, y))).collect();
+        let reliability = pixels().map(|(x, y)| if phrase_at(x, y) == 2 { 0.25 } else { 0.5 }).collect();
         let level = LevelField { codebook, features, reliability, ..LevelField::default() };
         let field = LanguageField {
             levels: vec![LevelField::default(), LevelField::default(), level],
             space: "test".into(),
         };
-        let codes =
-            Image { width: SIZE, height: SIZE, data: pixels().map(|(x, y)| shown(x, y) as i32).collect() };
+        let codes = Image {
+            width: SIZE,
+            height: SIZE,
+            data: pixels().map(|(x, y)| phrase_at(x, y) as i32).collect(),
+        };
         let none = Image::filled(SIZE, SIZE, -1);
         let mut rendered = RenderedFrame::empty(SIZE, SIZE, 0);
         rendered.depth.data.fill(1.0);
@@ -299,8 +304,8 @@ mod tests {
         Wall { field, prepared, cameras, frames, things: Arc::new(things) }
     }
 
-    /// A query in the embedding space made by rule.
-    fn made_query(text: &str) -> TextQuery {
+    /// A query in the rule-based embedding space of the tests.
+    fn rule_query(text: &str) -> TextQuery {
         TextQuery {
             text: text.to_owned(),
             embedding: text_embedding(text),
@@ -312,17 +317,16 @@ mod tests {
     impl Wall {
         fn ask(&self, text: &str, reading: Reading) -> Answers {
             let alternatives = Alternatives { things: self.things.clone(), colours: Vec::new() };
-            let query = TextQuery { alternatives, reading, ..made_query(text) };
+            let query = TextQuery { alternatives, reading, ..rule_query(text) };
             let views = (&self.cameras[..], &self.frames[..]);
             self.prepared.answer(&self.field, views, &query, &QueryOptions::default(), &mut None).unwrap()
         }
     }
 
     #[test]
-    fn an_absent_text_is_taken_back_everywhere() {
+    fn absent_text_clears_whole_answer() {
         let mut wall = wall();
-        // Whatever is asked, a hundred other things fit as well; the codes alone would say that it
-        // is found.
+        // A hundred other things fit every text as well; the codes alone would give a find.
         for text in ["red ball", "lemon"] {
             wall.things = Arc::new(text_embedding(text).repeat(100));
             let a = wall.ask(text, Reading::default());
@@ -345,7 +349,7 @@ mod tests {
     }
 
     #[test]
-    fn several_things_are_several_answers() {
+    fn several_things_give_several_instances() {
         let wall = wall();
         let balls = wall.ask("red ball", Reading::default());
         assert_eq!((balls.presence, balls.instances.len()), (Some(Presence::Found), 2));
@@ -359,7 +363,7 @@ mod tests {
             assert!((x.abs() - 0.3).abs() < 0.01 && number(&found["centre"][1]).abs() < 0.01, "{found}");
             assert!((number(&found["metres"]["centre"][0]) - 2.0 * x).abs() < 1e-9);
             let edge = number(&found["box"]["max"][0]) - number(&found["box"]["min"][0]);
-            // 17 pixels wide, of which 2 % lie outside on either side.
+            // 17 pixels wide, 2 % of them outside on either side.
             assert!((edge - 0.16).abs() < 0.011 && number(&found["splats"]) == 289.0, "{found}");
             let sizes = [0, 1, 2].map(|k| number(&found["oriented_box"]["size"][k]));
             assert!(sizes[0] > 0.14 && sizes[1] > 0.14 && sizes[2] < 1e-6, "{sizes:?}");
@@ -374,14 +378,14 @@ mod tests {
         );
         let lemon = wall.ask("lemon", Reading::default());
         assert!(lemon.instances.len() == 1 && (lemon.instances[0].reliability.unwrap() - 0.25).abs() < 1e-9);
-        // Where something stands before it, a thing is not seen.
+        // An occluded thing is not visible.
         let mut hidden = wall;
         hidden.frames[0].rendered.depth.data.fill(0.5);
         assert_eq!(hidden.ask("lemon", Reading::default()).instances[0].pixels, [None]);
     }
 
     #[test]
-    fn what_is_not_understood_is_unsure_at_most() {
+    fn doubtful_reading_is_unsure_at_most() {
         let wall = wall();
         assert_eq!(wall.ask("lemon", Reading::default()).presence, Some(Presence::Found));
         let cut = Phrasing { answers_for: "lemon".into(), not_understood: "on the plate".into() };
@@ -398,8 +402,9 @@ mod tests {
             assert!(a.found() == 1 && a.sentence() == format!("{}; {note}", a.verdict()), "{}", a.sentence());
             assert_eq!(a.shown().json()["notes"], json!([note]));
             let record = a.record(&["a".into()], &World::default());
-            let said = if a.reading.phrasing.is_some() { &record["phrasing"] } else { &record["vocabulary"] };
-            assert!(said["not_understood"] == "on the plate" || said["nearest"] == "orange", "{record}");
+            let noted =
+                if a.reading.phrasing.is_some() { &record["phrasing"] } else { &record["vocabulary"] };
+            assert!(noted["not_understood"] == "on the plate" || noted["nearest"] == "orange", "{record}");
         }
     }
 }

@@ -1,4 +1,4 @@
-//! A scene that more photos are added to: what it is, and what it was made with.
+//! A scene that photos are added to, with the record of its run.
 use super::record::{self, RunRecord};
 use crate::files;
 use crate::format::{colmap, scene_dir, scene_photos};
@@ -9,10 +9,10 @@ use crate::scene::{Camera, LanguageField, PointCloud, Seen, Splats, World};
 use crate::{Error, Result};
 use std::path::Path;
 
-/// What `--add` takes, for errors.
+/// Remedy in errors: scenes that `--add` accepts.
 const ADDABLE: &str = "--add takes a scene that splatvk run wrote";
 
-/// The record of a scene that photos can be added to.
+/// Reads the record of a scene, and refuses scenes that photos cannot be added to.
 pub fn record_of(scene: &Path) -> Result<RunRecord> {
     let record = record::read(scene, ADDABLE)?;
     let file = scene.join("run.json");
@@ -30,22 +30,22 @@ pub fn record_of(scene: &Path) -> Result<RunRecord> {
     }
 }
 
-/// A scene that goes on.
+/// A scene that photos are added to.
 #[derive(Clone, Debug)]
 pub struct BaseScene {
-    /// Its photos with their cameras.
+    /// Photos with their cameras.
     pub known: KnownPhotos,
-    /// Its splats, all of them.
+    /// All splats.
     pub splats: Splats,
-    /// What the photos show of them; nothing in scenes of earlier versions.
+    /// Blending weight of the splats in the photos; empty for scenes of earlier versions.
     pub seen: Seen,
-    /// How it lies in the world.
+    /// Direction up and scale.
     pub world: World,
     /// Codes and features.
     pub field: LanguageField,
-    /// Points of its surfaces.
+    /// Surface points.
     pub points: PointCloud,
-    /// A checksum of all this, for [`crate::pipeline::Stage::settings`].
+    /// Checksums of all this, for [`crate::pipeline::Stage::settings`].
     pub identity: String,
 }
 
@@ -66,12 +66,8 @@ impl BaseScene {
                 scene.cameras.len()
             )));
         }
-        let named = |(camera, photo): (Camera, &Photo)| {
-            let name =
-                photo.path.file_name().map_or_else(|| photo.stem.clone(), |n| n.to_string_lossy().into());
-            Camera { name, ..camera }
-        };
-        let cameras = scene.cameras.into_iter().zip(&photos).map(named).collect();
+        let cameras = scene.cameras.into_iter().zip(&photos);
+        let cameras = cameras.map(|(camera, photo)| Camera { name: file_name(photo), ..camera }).collect();
         let fitted = photos.iter().map(|p| record.fitted(&p.stem)).collect();
         let points = colmap::read_points(&path.join("cameras/colmap"))?;
         Ok(BaseScene {
@@ -85,24 +81,24 @@ impl BaseScene {
         })
     }
 
-    /// The photos that are not in the scene yet; those that are go with a warning.
-    pub fn without_its_own(&self, new: Vec<Photo>, progress: &dyn Progress) -> Result<Vec<Photo>> {
-        let known = |p: &Photo| self.known.photos.iter().any(|k| k.stem == p.stem && likeness(k, p) > SAME);
-        let (there, new): (Vec<Photo>, Vec<Photo>) = new.into_iter().partition(known);
-        let names: Vec<&str> = there.iter().map(|p| p.stem.as_str()).collect();
-        let words = if names.len() == 1 { "is" } else { "are" };
-        let said = format!("{} {words} in the scene already", files::listed(&names));
-        match (there.is_empty(), new.is_empty()) {
+    /// Photos that are not in the scene yet; warns about the others and drops them.
+    pub fn without_known(&self, new: Vec<Photo>, progress: &dyn Progress) -> Result<Vec<Photo>> {
+        let is_known = |p: &Photo| self.known.photos.iter().any(|k| is_same(k, p));
+        let (known, new): (Vec<Photo>, Vec<Photo>) = new.into_iter().partition(is_known);
+        let names: Vec<&str> = known.iter().map(|p| p.stem.as_str()).collect();
+        let verb = if names.len() == 1 { "is" } else { "are" };
+        let notice = format!("{} {verb} in the scene already", files::listed(&names));
+        match (known.is_empty(), new.is_empty()) {
             (true, _) => Ok(new),
-            (false, true) => Err(Error::input(format!("{said}; give photos that are not"))),
+            (false, true) => Err(Error::input(format!("{notice}; give photos that are not"))),
             (false, false) => {
-                progress.warn(&format!("{said} and left out"));
+                progress.warn(&format!("{notice} and left out"));
                 Ok(new)
             }
         }
     }
 
-    /// Refuses photos that cannot be added: too many, or under a name that the scene has.
+    /// Refuses too many photos, and names that the scene already has.
     pub fn check(&self, new: &[Photo]) -> Result<()> {
         let all: Vec<Photo> = self.known.photos.iter().chain(new).cloned().collect();
         if all.len() > photo::MAX_VIEWS {
@@ -113,10 +109,9 @@ impl BaseScene {
                 photo::MAX_VIEWS
             )));
         }
-        // Those of the scene have lost their lens and their light: what tells that a photo is the
-        // same is its name.
-        let known = |p: &Photo| self.known.photos.iter().any(|k| k.stem == p.stem);
-        if let Some(again) = new.iter().find(|p| known(p)) {
+        // Lens and light were taken out of the scene's photos, so the name identifies a photo.
+        let is_known = |p: &&Photo| self.known.photos.iter().any(|k| k.stem == p.stem);
+        if let Some(again) = new.iter().find(is_known) {
             return Err(Error::input(format!(
                 "{}: a photo of the name \"{}\" is in the scene already; leave it out, or rename it if it is another one",
                 again.path.display(),
@@ -127,18 +122,27 @@ impl BaseScene {
     }
 }
 
-/// Side of the pictures that are compared: lens and light, which were taken out of one of them,
+/// Name of a photo's file; its stem if it has none.
+fn file_name(photo: &Photo) -> String {
+    photo.path.file_name().map_or_else(|| photo.stem.clone(), |n| n.to_string_lossy().into())
+}
+
+/// Whether name and content of two photos agree.
+fn is_same(a: &Photo, b: &Photo) -> bool {
+    a.stem == b.stem && luma_correlation(a, b) > SAME
+}
+
+/// Side of the compared thumbnails, pixels: lens and light, which were taken out of one of them,
 /// change little at this size.
 const COMPARED: usize = 24;
-/// Correlation of their brightness from which two photos of one name are one photo. On `breakfast`
-/// a photo and itself through a lens (k1 −0.12, k2 0.03) and gains of 0.6 to 0.75 reach 0.994,
-/// different photos at most 0.51.
+/// Luma correlation from which two photos of one name are the same photo. On `breakfast` a photo
+/// and itself through a lens (k1 −0.12, k2 0.03) and gains of 0.6 to 0.75 reach 0.994, different
+/// photos at most 0.51.
 const SAME: f64 = 0.95;
 
-fn likeness(a: &Photo, b: &Photo) -> f64 {
-    let small = |p: &Photo| p.image.resized_by_area(COMPARED, COMPARED).luma().data;
-    let (a, b) = (small(a), small(b));
-    let mean = |v: &[f32]| v.iter().copied().map(f64::from).sum::<f64>() / v.len() as f64;
+/// Pearson correlation of the photos' luma thumbnails.
+fn luma_correlation(a: &Photo, b: &Photo) -> f64 {
+    let (a, b) = (luma_thumbnail(a), luma_thumbnail(b));
     let (ma, mb) = (mean(&a), mean(&b));
     let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
     for (x, y) in a.iter().zip(&b) {
@@ -146,6 +150,14 @@ fn likeness(a: &Photo, b: &Photo) -> f64 {
         (ab, aa, bb) = (ab + x * y, aa + x * x, bb + y * y);
     }
     ab / (aa * bb).sqrt().max(f64::MIN_POSITIVE)
+}
+
+fn luma_thumbnail(photo: &Photo) -> Vec<f32> {
+    photo.image.resized_by_area(COMPARED, COMPARED).luma().data
+}
+
+fn mean(values: &[f32]) -> f64 {
+    values.iter().copied().map(f64::from).sum::<f64>() / values.len() as f64
 }
 
 fn identity(path: &Path) -> Result<String> {
@@ -165,10 +177,9 @@ mod tests {
     use crate::scene::Lens;
 
     #[test]
-    fn photos_of_the_scene_are_known_again() {
+    fn known_photos_are_recognised_after_correction() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast/images");
-        let read = |k: usize| photo::load(&folder.join(format!("train_0{k}.jpg"))).unwrap();
-        let photos = [0, 1, 2, 3].map(read);
+        let photos = [0, 1, 2, 3].map(|k| photo::load(&folder.join(format!("train_0{k}.jpg"))).unwrap());
         let camera = Camera {
             name: "a".into(),
             width: 640,
@@ -179,8 +190,8 @@ mod tests {
             cy: 240.0,
             pose: crate::scene::Pose::IDENTITY,
         };
-        // As a scene keeps it: without lens, darker and with another white.
-        let kept = |p: &Photo| {
+        // The scene's copy: without lens distortion, darker, with another white balance.
+        let as_in_scene = |p: &Photo| {
             let mut p = p.clone();
             p.straighten(Lens::radial(-0.12, 0.03), &camera);
             p.image.data.iter_mut().for_each(|c| *c = [0.6 * c[0], 0.7 * c[1], 0.75 * c[2]]);
@@ -188,8 +199,9 @@ mod tests {
         };
         for (i, a) in photos.iter().enumerate() {
             for (j, b) in photos.iter().enumerate() {
-                println!("{i} {j} {:.3}", likeness(&kept(a), b));
-                assert_eq!(likeness(&kept(a), b) > SAME, i == j, "{i} {j}");
+                let correlation = luma_correlation(&as_in_scene(a), b);
+                println!("{i} {j} {correlation:.3}");
+                assert_eq!(correlation > SAME, i == j, "{i} {j}");
             }
         }
     }

@@ -1,4 +1,4 @@
-//! Which codes a pixel may decode to, where codes are short
+//! Restriction of a pixel's short codes to those that its splats carry
 //! (docs/internals/method.md#short-codes-at-borders).
 use crate::gpu::Device;
 use crate::pass::renderer::Renderer;
@@ -7,33 +7,34 @@ use crate::scene::{Camera, Image, LevelField, Splats};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
-/// Codes of so many numbers need the rule: with 3 a mix of two codes is nearest to a third at
+/// Longest code that needs the rule: with length 3 a mix of two codes is nearest to a third at
 /// almost every border, with 8 hardly ever (docs/internals/method.md#code-length).
 const SHORT: usize = 4;
-/// Books with more codes are no things of a scene but a table of directions (an autoencoder's),
-/// whose neighbours mean the same.
+/// Codebooks with more codes do not hold the things of a scene but a table of directions (an
+/// autoencoder's), whose neighbours mean the same.
 const MOST_CODES: usize = 512;
-/// Least blending weight of the splats of a code: what is solid has a weight of 1, and of three
-/// things that share a pixel the least has less than this or is no ghost.
+/// Minimum blending weight of a code's splats in a pixel that decodes to it. A solid thing has a
+/// weight of 1; the faintest of three things in one pixel is below this bound or really visible.
 const LEAST_WEIGHT: f32 = 0.1;
 /// Codes whose weights are rendered at once: as many as features of the usual length, which every
 /// device binds.
 const AT_ONCE: usize = 16;
 
-/// What renders how much of every pixel the splats of each code are.
+/// Renders the blending weight of every code's splats per pixel.
 pub(super) struct Border {
     renderer: Renderer,
-    /// Per splat.
+    /// Code of each splat.
     codes: Vec<Option<usize>>,
-    /// That some splat carries, ascending.
+    /// Codes that some splat carries, ascending.
     carried: Vec<usize>,
-    /// [K, d]
+    /// Codebook, [K, d].
     book: Vec<f32>,
     d: usize,
 }
 
 impl Border {
-    /// For a level whose features `splats` carry; `None` where its codes need no such rule.
+    /// Prepares the rule for a level whose features `splats` carry; `None` if its codes do not need
+    /// it.
     pub fn new(device: &Device, splats: &Splats, level: &LevelField) -> Result<Option<Border>> {
         let (d, book) = (level.codebook.code_dim, &level.codebook);
         if d == 0
@@ -51,18 +52,18 @@ impl Border {
         Ok(Some(Border { renderer, codes, carried, book: book.codes.clone(), d }))
     }
 
-    /// Gives every pixel that has a code the nearest of those that are really there. `features` are
-    /// the blended ones, [H, W, d].
-    pub fn settle(&mut self, camera: &Camera, features: &[f32], codes: &mut Image<i32>) -> Result<()> {
+    /// Decodes every pixel that has a code again, to the nearest of the codes that its splats
+    /// carry. `features` are the blended ones, [H, W, d].
+    pub fn decode_again(&mut self, camera: &Camera, features: &[f32], codes: &mut Image<i32>) -> Result<()> {
         let d = self.d;
         if features.len() != codes.data.len() * d {
             return Err(Error::work("features of another frame"));
         }
         let mut best = vec![f32::NEG_INFINITY; codes.data.len()];
-        for some in self.carried.chunks(AT_ONCE) {
+        for chunk in self.carried.chunks(AT_ONCE) {
             let mut one_hot = vec![0f32; AT_ONCE * self.codes.len()];
             for (row, code) in one_hot.chunks_exact_mut(AT_ONCE).zip(&self.codes) {
-                if let Some(k) = code.and_then(|code| some.iter().position(|c| *c == code)) {
+                if let Some(k) = code.and_then(|code| chunk.iter().position(|c| *c == code)) {
                     row[k] = 1.0;
                 }
             }
@@ -73,7 +74,7 @@ impl Border {
                 if *code < 0 {
                     return;
                 }
-                for (&k, _) in some.iter().zip(weights).filter(|(_, w)| **w >= LEAST_WEIGHT) {
+                for (&k, _) in chunk.iter().zip(weights).filter(|(_, w)| **w >= LEAST_WEIGHT) {
                     let dot = feature.iter().zip(&self.book[k * d..]).map(|(a, b)| a * b).sum::<f32>();
                     if dot > *best {
                         (*best, *code) = (dot, k as i32);
@@ -93,7 +94,7 @@ mod tests {
     use crate::scene::{Codebook, LanguageField};
 
     #[test]
-    fn a_border_of_two_things_shows_no_third() {
+    fn border_of_two_shows_no_third() {
         let device = crate::gpu::open(None).unwrap();
         let (mut splats, camera) = seeded::small(600, 96, 72, 0, 1003);
         splats.opacity_logits.fill(1.0);

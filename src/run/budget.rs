@@ -1,7 +1,7 @@
-//! What a run needs of memory, known before it begins: bytes per stage from the number and the
-//! sizes of the photos, against what the device binds and holds and what the host has left.
+//! Memory of a run, estimated before it begins: bytes per stage from the number and the sizes of
+//! the photos, against the limits of the device and the free memory of the host.
 //!
-//! The figures per pixel and splat are those of the buffers that the stages make (`fit::views`,
+//! Figures per pixel and splat are those of the buffers that the stages create (`fit::views`,
 //! `fit::model`, `pass::rasterizer`, `pass::ssim_l1`, `pose::stereo`); those of the host are
 //! measured (docs/internals/performance.md).
 use crate::fit::{Preset, RgbOptions};
@@ -13,18 +13,17 @@ use crate::photo::{SMALLEST_SIDE, working_size};
 use crate::scene::LEVEL_NAMES;
 use crate::{Error, Result};
 
-/// Bytes of the host per pixel of all photos: pictures, depth, points, masks, labels, and at the
-/// end every view with its codes.
+/// Host bytes per pixel of all photos: images, depth, points, masks, labels, and at the end every
+/// view with its codes.
 const HOST_PIXEL: u64 = 150;
-/// Bytes of the host per pixel of all photos at the size that they are matched at: planes, and the
-/// surfaces made of them.
+/// Host bytes per pixel of all photos at stereo size: planes, and the surfaces made from them.
 const STEREO_PIXEL: u64 = 150;
-/// Bytes of the host per pixel of one photo, as the edge network sees it: three maps of 64
+/// Host bytes per pixel of one photo at the input size of the edge network: three maps of 64
 /// channels.
 const NETWORK_PIXEL: u64 = 768;
-/// Longer side that this network sees at most (`infer::hed`).
+/// Longest input side of the edge network, pixels (`infer::hed`).
 const NETWORK_SIDE: usize = 1600;
-/// Bytes of the host whatever the photos: networks, texts, the program.
+/// Host bytes independent of the photos: networks, texts, the program.
 const HOST_BASE: u64 = 300 << 20;
 /// Views that stereo binds at once: a reference and its sources.
 const STEREO_VIEWS: u64 = MAX_SOURCES as u64 + 1;
@@ -33,39 +32,40 @@ const HEAP_SHARE: f64 = 0.9;
 /// Splats that continue the surfaces beyond one photo's border, at most (`fit::margin`).
 const MARGIN: usize = 15_000;
 
-/// What there is.
+/// Memory limits of a machine.
 #[derive(Clone, Debug)]
 pub struct Limits {
     /// The device.
     pub device: DeviceInfo,
-    /// Memory of the host that is free, bytes; `None` where the system does not tell.
+    /// Free memory of the host, bytes; `None` if the system does not report it.
     pub host: Option<u64>,
 }
 
 impl Limits {
-    /// Those of this machine, now.
+    /// Limits of this machine at present.
     pub fn now(device: &DeviceInfo) -> Limits {
         Limits { device: device.clone(), host: available() }
     }
 }
 
-/// What the memory of a run depends on.
+/// Settings that determine the memory of a run.
 #[derive(Clone, Copy, Debug)]
 pub struct MemoryDemand {
-    /// Feature channels that are trained together; 0 without language.
+    /// Feature channels that train together; 0 without language.
     pub features: usize,
-    /// Splats at most.
+    /// Maximum number of splats.
     pub splats: usize,
 }
 
 impl MemoryDemand {
-    /// A run with codes of this length, all levels together or one after the other.
+    /// Demand of a run with codes of this length; `per_level` trains the levels one after the
+    /// other.
     pub fn language(code_dim: usize, per_level: bool, preset: Preset, photos: usize) -> MemoryDemand {
         let levels = if per_level { 1 } else { LEVEL_NAMES.len() };
         MemoryDemand { features: levels * code_dim, ..MemoryDemand::colour(preset, photos) }
     }
 
-    /// Colour only.
+    /// Demand of a run without language.
     pub fn colour(preset: Preset, photos: usize) -> MemoryDemand {
         let options = RgbOptions::preset(preset);
         let margin = if options.margin > 0.0 { MARGIN * photos } else { 0 };
@@ -73,71 +73,83 @@ impl MemoryDemand {
     }
 }
 
-/// Bytes that a stage holds at its peak.
+/// Peak memory of a stage, bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct StageMemory {
-    /// As the progress calls it.
+    /// Name of the stage in the progress output.
     pub name: &'static str,
-    /// On the device.
+    /// Bytes on the device.
     pub device: u64,
-    /// In the host's memory, without what a CPU device keeps there.
+    /// Bytes on the host, without those of a CPU device.
     pub host: u64,
 }
 
-/// Bytes per stage for photos of these working sizes. An error where an image cannot even be
-/// rendered in bands.
+/// Memory per stage for photos of these working sizes.
+///
+/// # Errors
+/// An image that cannot be rendered even in bands.
 pub fn stages(
     device: &DeviceInfo,
     sizes: &[(usize, usize)],
     work: &MemoryDemand,
 ) -> Result<Vec<StageMemory>> {
-    let pixels = |s: &(usize, usize)| (s.0 * s.1) as u64;
     let all: u64 = sizes.iter().map(pixels).sum();
-    // `pose::stereo` halves the size until a reference and its sources fit; this is what they hold
-    // then at most.
+    // `pose::stereo` halves the size until a reference and its sources fit. This is their upper
+    // bound.
     let group = 16 * all.min(STEREO_VIEWS * sizes.iter().map(pixels).max().unwrap_or(0));
     let share = (device.max_storage_range as f64 / group.max(1) as f64).min(1.0);
     let matched = (all as f64 * share) as u64;
-    let seen = |s: &(usize, usize)| pixels(&working_size(s.0, s.1, NETWORK_SIDE));
-    let network = NETWORK_PIXEL * sizes.iter().map(seen).max().unwrap_or(0);
-    // Freed memory stays with the process, so that the largest of everything counts in all stages.
+    let network_pixels = sizes.iter().map(|s| pixels(&working_size(s.0, s.1, NETWORK_SIDE))).max();
+    let network = NETWORK_PIXEL * network_pixels.unwrap_or(0);
+    // Freed memory stays with the process, so the maximum counts in all stages.
     let host = HOST_BASE + HOST_PIXEL * all + STEREO_PIXEL * matched + network;
-    let training = |features: usize| -> Result<u64> {
-        let (channels, splats) = (BASE_CHANNELS + features, work.splats as u64);
-        let mut distinct: Vec<(usize, usize)> = Vec::new();
-        sizes.iter().for_each(|s| {
-            if !distinct.contains(s) {
-                distinct.push(*s)
-            }
-        });
-        let mut bytes = 0;
-        for &(w, h) in &distinct {
-            let stored = Bands::new(device, w, h, channels)?.pixels() as u64;
-            // Planes and their gradients; transmittance, loss; SSIM: three vec2 and one float per
-            // colour.
-            bytes += stored * (4 * (2 * channels as u64 + 1) + 8 + 84);
-            // On the screen: 12 + 12 floats, the features and their gradients, depth keys and their
-            // sort; eight entries of 20 bytes in the lists.
-            bytes += splats * (96 + 8 * features as u64 + 16 + 160);
-        }
-        // Photo, depth, and a label per level.
-        bytes += all * (12 + if features > 0 { 12 } else { 4 });
-        // Value, gradient and two moments of each parameter, at SH degree 0.
-        Ok(bytes + splats * 16 * (14 + features as u64))
-    };
     let stereo = StageMemory { name: "dense stereo", device: 24 * matched, host };
-    let colour = StageMemory { name: "splats", device: training(0)?, host };
+    let colour = StageMemory { name: "splats", device: training_bytes(device, sizes, work.splats, 0)?, host };
     let mut stages = vec![stereo, colour];
     if work.features > 0 {
-        stages.push(StageMemory { name: "language", device: training(work.features)?, host });
+        let bytes = training_bytes(device, sizes, work.splats, work.features)?;
+        stages.push(StageMemory { name: "language", device: bytes, host });
     }
     Ok(stages)
 }
 
-/// Why photos of these sizes do not work, or nothing.
+fn pixels(&(width, height): &(usize, usize)) -> u64 {
+    (width * height) as u64
+}
+
+/// Bytes on the device during training with this many feature channels.
+fn training_bytes(
+    device: &DeviceInfo,
+    sizes: &[(usize, usize)],
+    splats: usize,
+    features: usize,
+) -> Result<u64> {
+    let (channels, splats) = (BASE_CHANNELS + features, splats as u64);
+    let mut distinct: Vec<(usize, usize)> = Vec::new();
+    sizes.iter().for_each(|s| {
+        if !distinct.contains(s) {
+            distinct.push(*s)
+        }
+    });
+    let mut bytes = 0;
+    for &(w, h) in &distinct {
+        let stored = Bands::new(device, w, h, channels)?.pixels() as u64;
+        // Planes and their gradients; transmittance, loss; SSIM: three vec2 and one float per
+        // colour.
+        bytes += stored * (4 * (2 * channels as u64 + 1) + 8 + 84);
+        // Projected splats: 12 + 12 floats, the features and their gradients, depth keys and their
+        // sort; eight entries of 20 bytes in the lists.
+        bytes += splats * (96 + 8 * features as u64 + 16 + 160);
+    }
+    // Photo, depth, and a label per level.
+    bytes += sizes.iter().map(pixels).sum::<u64>() * (12 + if features > 0 { 12 } else { 4 });
+    // Value, gradient and two moments of each parameter, at SH degree 0.
+    Ok(bytes + splats * 16 * (14 + features as u64))
+}
+
+/// Reason why photos of these sizes do not fit, or `None`.
 fn obstacle(limits: &Limits, sizes: &[(usize, usize)], work: &MemoryDemand) -> Option<String> {
     let device = &limits.device;
-    let gib = |b: u64| b as f64 / f64::from(1 << 30);
     let stages = match stages(device, sizes, work) {
         Ok(stages) => stages,
         Err(_) => {
@@ -169,7 +181,11 @@ fn obstacle(limits: &Limits, sizes: &[(usize, usize)], work: &MemoryDemand) -> O
     None
 }
 
-/// Refuses a working size that cannot be done, and names the largest that can. `originals` are the
+fn gib(bytes: u64) -> f64 {
+    bytes as f64 / f64::from(1 << 30)
+}
+
+/// Refuses a working size that does not fit, and names the largest that does. `originals` are the
 /// (width, height) of the photos.
 pub fn check(
     limits: &Limits,
@@ -177,33 +193,36 @@ pub fn check(
     max_size: usize,
     work: &MemoryDemand,
 ) -> Result<()> {
-    let at = |size: usize| -> Vec<(usize, usize)> {
+    let scaled_to = |size: usize| -> Vec<(usize, usize)> {
         originals.iter().map(|&(w, h)| working_size(w, h, size)).collect()
     };
-    let Some(why) = obstacle(limits, &at(max_size), work) else { return Ok(()) };
+    let Some(reason) = obstacle(limits, &scaled_to(max_size), work) else { return Ok(()) };
     let longest = originals.iter().map(|s| s.0.max(s.1)).max().unwrap_or(0).min(max_size);
-    let works = |size: usize| obstacle(limits, &at(size), work).is_none();
-    if longest <= SMALLEST_SIDE || !works(SMALLEST_SIDE) {
-        return Err(Error::input(format!("{} photos are too many for this machine: {why}", originals.len())));
+    let fits = |size: usize| obstacle(limits, &scaled_to(size), work).is_none();
+    if longest <= SMALLEST_SIDE || !fits(SMALLEST_SIDE) {
+        return Err(Error::input(format!(
+            "{} photos are too many for this machine: {reason}",
+            originals.len()
+        )));
     }
-    let (mut good, mut bad) = (SMALLEST_SIDE, longest);
-    while bad - good > 1 {
-        let middle = good + (bad - good) / 2;
-        if works(middle) { good = middle } else { bad = middle }
+    let (mut fitting, mut too_large) = (SMALLEST_SIDE, longest);
+    while too_large - fitting > 1 {
+        let middle = fitting + (too_large - fitting) / 2;
+        if fits(middle) { fitting = middle } else { too_large = middle }
     }
     Err(Error::input(format!(
-        "photos of {longest} pixels are too large for this machine: {why}; the largest that works is --max-size {good}"
+        "photos of {longest} pixels are too large for this machine: {reason}; the largest that works is --max-size {fitting}"
     )))
 }
 
-/// Splats that the device binds with this many features: a feature's two moments are the widest
-/// row.
+/// Maximum number of splats that the device binds with this many features. The two moments of the
+/// features are the widest row.
 pub fn most_splats(device: &DeviceInfo, features: usize) -> usize {
-    let row = (8 * features).max(96);
-    (device.max_storage_range / row as u64) as usize
+    let row_bytes = (8 * features).max(96);
+    (device.max_storage_range / row_bytes as u64) as usize
 }
 
-/// Memory of the host that can be had without taking it from others, bytes.
+/// Memory of the host that is available without swapping, bytes.
 fn available() -> Option<u64> {
     let text = std::fs::read_to_string("/proc/meminfo").ok()?;
     let line = text.lines().find_map(|l| l.strip_prefix("MemAvailable:"))?;
@@ -224,7 +243,7 @@ mod tests {
     const PHOTOS: [(usize, usize); 4] = [(4032, 3024); 4];
 
     #[test]
-    fn what_fits_is_let_through_and_the_named_size_works() {
+    fn budget_names_largest_fitting_size() {
         let work = MemoryDemand::language(16, false, Preset::Draft, 4);
         assert!(check(&limits(4), &PHOTOS, 800, &work).is_ok());
         let e = check(&limits(4), &PHOTOS, 4032, &work).unwrap_err();
@@ -238,7 +257,7 @@ mod tests {
     }
 
     #[test]
-    fn images_wider_than_a_band_are_refused_by_width() {
+    fn budget_refuses_images_wider_than_bands() {
         let work = MemoryDemand::language(16, false, Preset::Draft, 2);
         let wide = [(40_000, 2000); 2];
         let message = check(&limits(1000), &wide, 40_000, &work).unwrap_err().to_string();
@@ -247,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn a_gpu_is_held_to_its_own_memory() {
+    fn budget_limits_gpu_to_its_memory() {
         let mut limits = limits(1000);
         (limits.device.is_cpu, limits.device.memory) = (false, 2 << 30);
         let work = MemoryDemand::language(16, false, Preset::Default, 4);

@@ -1,6 +1,6 @@
-//! `--compat`: what the paper, its authors' code and LangSplat do otherwise than this program by
-//! default (docs/internals/method.md#differences-from-the-paper). Each switch is a field here, and
-//! a row of the table there.
+//! `--compat`: choices of the paper, its authors' code and LangSplat that differ from this
+//! program's defaults (docs/internals/method.md#differences-from-the-paper). Each switch is a field
+//! here and a row of the table there.
 use super::method::Method;
 use crate::language::Reducer;
 use crate::language::align::{AlignOptions, AreaScore};
@@ -14,13 +14,13 @@ use std::path::Path;
 /// A set of switches.
 #[derive(Debug, PartialEq)]
 pub struct Compat {
-    /// As users write it.
+    /// Name on the command line.
     pub name: &'static str,
-    /// Whose, in a line.
+    /// Description in one line.
     pub about: &'static str,
     /// Scores, thresholds and conditions of the alignment.
     pub align: AlignOptions,
-    /// Masks of a network are painted in the order in which it gave them, not larger ones first.
+    /// Paint masks of a network in its output order, not larger ones first.
     pub paint_in_order: bool,
     /// Length of the codes.
     pub feature_dim: usize,
@@ -44,7 +44,7 @@ impl<'de> Deserialize<'de> for &'static Compat {
     }
 }
 
-/// What the text states; where it states no condition, there is none.
+/// Choices that the text of the paper states; a condition that it does not state is off.
 pub const PAPER: Compat = Compat {
     name: "paper",
     about: "as the paper states it",
@@ -65,8 +65,8 @@ pub const PAPER: Compat = Compat {
     mask: MaskRule::Lerf(0.6),
 };
 
-/// What the code of the authors does with its own defaults. Its step 2 asks for a score above 2 τ₁
-/// = 1, which none has.
+/// Choices of the authors' code with its own defaults. Its step 2 requires a score above 2 τ₁ = 1,
+/// which no pair reaches.
 pub const AUTHORS: Compat = Compat {
     name: "authors",
     about: "as the code that the paper's authors published does it",
@@ -75,8 +75,7 @@ pub const AUTHORS: Compat = Compat {
     ..PAPER
 };
 
-/// What LangSplat does with masks, codes and answers; it has no alignment, so that of this program
-/// stays.
+/// Masks, codes and answers of LangSplat. It has no alignment, so this program's stays.
 pub const LANGSPLAT: Compat = Compat {
     name: "langsplat",
     about: "masks, codes and answers as in LangSplat",
@@ -86,14 +85,14 @@ pub const LANGSPLAT: Compat = Compat {
     ..PAPER
 };
 
-/// What `--compat` takes.
+/// Values of `--compat`.
 pub static COMPATS: [&Compat; 3] = [&PAPER, &AUTHORS, &LANGSPLAT];
 
-/// For `--compat` of a scene that was made with one: this program's own way after all.
+/// Value of `--compat` for this program's own choices in a scene that was made with another one.
 pub const NONE: &str = "none";
 
 impl Compat {
-    /// The one of a name; `None` for [`NONE`].
+    /// Finds a set by name; `None` for [`NONE`].
     pub fn named(name: &str) -> Result<Option<&'static Compat>> {
         if name == NONE {
             return Ok(None);
@@ -104,16 +103,17 @@ impl Compat {
         })
     }
 
-    /// What a scene was made with; `None` also for files that no run made. A record that cannot be
-    /// read is an error: the scene would answer in another way than it was made for.
+    /// Reads the set that a scene was made with; `None` also for files without a run record. An
+    /// unreadable record is an error: the scene would answer in another way than it was made for.
     pub fn of_scene(scene: &Path) -> Result<Option<&'static Compat>> {
         let file = scene.join("run.json");
-        let absent = |e: std::io::Error| matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory);
-        if file.symlink_metadata().is_err_and(absent) {
+        let is_absent =
+            |e: std::io::Error| matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory);
+        if file.symlink_metadata().is_err_and(is_absent) {
             return Ok(None);
         }
         let remedy = "it says how the scene answers: restore it, or delete it to have answers in this program's own way";
-        let damaged = |what: &str| Error::input(format!("{}: {what}; {remedy}", file.display()));
+        let damaged = |problem: &str| Error::input(format!("{}: {problem}; {remedy}", file.display()));
         let record: Value = files::read_json(&file, remedy)?;
         match record.get("config").map(|config| &config["plan"]["compat"]) {
             None => Err(damaged("no record of a run")),
@@ -125,7 +125,7 @@ impl Compat {
         }
     }
 
-    /// What decides answers: of `asked`, or else of what the scene was made with.
+    /// Query options of `asked`, or of the set that the scene was made with.
     pub fn answers(asked: Option<&str>, scene: &Path) -> Result<QueryOptions> {
         let compat = match asked {
             Some(name) => Compat::named(name)?,
@@ -135,13 +135,13 @@ impl Compat {
     }
 }
 
-/// Length of the codes. A baseline has that of its authors.
+/// Length of the codes. A baseline keeps that of its authors.
 pub fn feature_dim(compat: Option<&Compat>, method: &Method) -> usize {
-    let ours = compat.filter(|_| method.recipe.reducer == Reducer::Bijection);
-    ours.map_or(method.recipe.feature_dim, |c| c.feature_dim)
+    let applicable = compat.filter(|_| method.recipe.reducer == Reducer::Bijection);
+    applicable.map_or(method.recipe.feature_dim, |c| c.feature_dim)
 }
 
-/// How answers are chosen.
+/// Query options of a set.
 pub fn query_options(compat: Option<&Compat>) -> QueryOptions {
     compat.map_or_else(QueryOptions::default, |c| QueryOptions { mask: c.mask, ..QueryOptions::default() })
 }
@@ -151,7 +151,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_are_understood_and_others_refused_with_the_choices() {
+    fn compat_refuses_unknown_names_with_choices() {
         for compat in COMPATS {
             assert_eq!(Compat::named(compat.name).unwrap(), Some(compat));
         }
@@ -164,27 +164,27 @@ mod tests {
     }
 
     #[test]
-    fn a_scene_answers_as_it_was_made_unless_something_else_is_asked_for() {
+    fn answers_follow_record_unless_overridden() {
         let folder = tempfile::tempdir().unwrap();
-        let rule = |asked: Option<&str>| Compat::answers(asked, folder.path()).unwrap().mask;
+        let mask_rule = |asked: Option<&str>| Compat::answers(asked, folder.path()).unwrap().mask;
         let ours = QueryOptions::default().mask;
-        assert_eq!(rule(None), ours, "a folder without run.json");
-        let record = |compat: &str| {
+        assert_eq!(mask_rule(None), ours, "a folder without run.json");
+        let write_record = |compat: &str| {
             let text = format!("{{\"config\": {{\"plan\": {{{compat}}}}}}}");
             std::fs::write(folder.path().join("run.json"), text).unwrap();
         };
-        record("");
-        assert_eq!(rule(None), ours, "a run of before");
-        record("\"compat\": \"langsplat\"");
-        assert_eq!(rule(None), MaskRule::Lerf(0.4));
-        assert_eq!((rule(Some("paper")), rule(Some("none"))), (MaskRule::Lerf(0.6), ours));
+        write_record("");
+        assert_eq!(mask_rule(None), ours, "a run of before");
+        write_record("\"compat\": \"langsplat\"");
+        assert_eq!(mask_rule(None), MaskRule::Lerf(0.4));
+        assert_eq!((mask_rule(Some("paper")), mask_rule(Some("none"))), (MaskRule::Lerf(0.6), ours));
         for damaged in ["", "{\"config\"", "[]", "{}", "{\"config\":{\"plan\":{\"compat\":3}}}"] {
             std::fs::write(folder.path().join("run.json"), damaged).unwrap();
             let error = Compat::answers(None, folder.path()).unwrap_err();
             assert!(error.exit_code() == 2 && error.to_string().contains("run.json: "), "{error}");
-            assert_eq!(rule(Some("paper")), MaskRule::Lerf(0.6), "it is not asked");
+            assert_eq!(mask_rule(Some("paper")), MaskRule::Lerf(0.6), "it is not asked");
         }
-        record("\"compat\": \"mine\"");
+        write_record("\"compat\": \"mine\"");
         let error = Compat::answers(None, folder.path()).unwrap_err().to_string();
         assert!(error.contains("unknown --compat \"mine\"; it says how"), "{error}");
         std::fs::remove_file(folder.path().join("run.json")).unwrap();

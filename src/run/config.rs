@@ -18,8 +18,8 @@ use crate::{Error, Result};
 pub use arguments::compat_names;
 use serde::{Deserialize, Serialize};
 
-/// Every setting that changes the result of a reconstruction. The default takes the built-in
-/// sources; everything else is as the device and the photos suggest.
+/// Every setting that changes the result of a reconstruction. By default sources are built in, and
+/// the device and the photos determine the rest.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ReconstructionConfig {
@@ -211,8 +211,7 @@ fn resolve<K: SourceKind>(choice: &mut SourceChoice, installed: &Inventory) -> R
 impl LanguageConfig {
     /// The method, or else the one that suits the other settings.
     pub fn method(&self, preset: Option<Preset>) -> &'static Method {
-        let suiting = || Method::by_default(preset, self.language_iterations, self.per_level());
-        self.method.unwrap_or_else(suiting)
+        self.method.unwrap_or_else(|| Method::by_default(preset, self.language_iterations, self.per_level()))
     }
 
     /// Length of the codes.

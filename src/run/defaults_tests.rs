@@ -1,6 +1,6 @@
 //! The built-in language defaults end to end in 2D: graph masks, `words` features, XFeat matches,
-//! alignment, codebook and queries on the training targets (what a perfectly trained field would
-//! show).
+//! alignment, codebook and queries on the training targets (the output of a perfectly trained
+//! field).
 use crate::infer::words::RegionWords;
 use crate::infer::{Registry, hed::Hed, xfeat::XFeat};
 use crate::language::align::{PairLinks, links_from_warps};
@@ -23,17 +23,16 @@ struct Inputs {
 
 fn inputs() -> Inputs {
     let views = train_views();
-    let open = || Registry::open(None).unwrap();
-    let (mut hed, mut net) = (Hed::load(&open()).unwrap(), XFeat::load(&open()).unwrap());
-    let words = SharedEncoder::new(Box::new(RegionWords::load(open()).unwrap()), String::new());
+    let registry = Registry::open(None).unwrap();
+    let (mut hed, mut xfeat) = (Hed::load(&registry).unwrap(), XFeat::load(&registry).unwrap());
+    let words = SharedEncoder::new(Box::new(RegionWords::load(registry).unwrap()), String::new());
     let (mut masks, mut depths, mut dense) = (Vec::new(), Vec::new(), Vec::new());
     for v in &views {
         let known = v.depth.data.iter().map(|&z| f32::from(z > 0.0)).collect();
         let depth = DepthMap { depth: v.depth.clone(), confidence: Image { data: known, ..v.depth } };
         let edges = hed.edges(&v.image).unwrap();
-        let m = segment(&v.image, &edges, &GraphOptions::default()).unwrap();
-        dense.push(net.dense(&v.image).unwrap());
-        masks.push(m);
+        masks.push(segment(&v.image, &edges, &GraphOptions::default()).unwrap());
+        dense.push(xfeat.dense(&v.image).unwrap());
         depths.push(depth);
     }
     describe(&mut masks, views.iter().map(|v| &v.image), &words, &Silent).unwrap();
@@ -45,11 +44,11 @@ fn inputs() -> Inputs {
         }
     }
     let canonicals = words.with(|e| e.embed_texts(&CANONICAL_PHRASES)).unwrap();
-    let ask = |(k, text): (i32, String)| {
+    let query = |(k, text): (i32, String)| {
         let embedding = words.with(|e| e.embed_texts(&[&text])).unwrap();
         (k, TextQuery { text, embedding, canonicals: canonicals.clone(), ..Default::default() })
     };
-    let queries = phrases().into_iter().filter(|(k, _)| *k > 3).map(ask).collect();
+    let queries = phrases().into_iter().filter(|(k, _)| *k > 3).map(query).collect();
     Inputs { views, masks, depths, matched, queries }
 }
 
@@ -80,9 +79,8 @@ fn lemon_and_mug_are_found() {
     for (text, row) in &rows {
         println!("R {text}: {row:.2?}");
     }
-    // The plate is not asked for: with exact depth the built-in masks of one view join it to the
-    // table, which the smoother depth of stereo does not bring about (`splatvk eval` measures
-    // that).
+    // The plate is not queried: with exact depth the built-in masks of one view join it to the
+    // table; the smoother depth of stereo does not (`splatvk eval` measures that).
     for name in ["lemon", "blue mug"] {
         let row = &rows.iter().find(|r| r.0 == name).unwrap().1;
         assert!(row.iter().filter(|r| r.1).count() >= 3, "{name}: {row:?}");

@@ -4,8 +4,8 @@ use crate::format::scene_dir::{Scene, TEXT_EMBEDDINGS};
 use crate::infer::{RegionEncoder, Registry};
 use crate::{Error, Result};
 
-/// For precomputed features the table of text embeddings that the scene carries, and a network;
-/// else the model that the scene was made with.
+/// Loads the text encoder of a scene: for precomputed features the scene's table of text embeddings
+/// with a network, else the model that the scene was made with.
 pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncoder>> {
     let table = scene.path.join(TEXT_EMBEDDINGS);
     let levels = scene.language.iter().flat_map(|l| &l.levels);
@@ -14,7 +14,7 @@ pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncod
     if table.symlink_metadata().is_ok() || space == sources::DIR_SPACE {
         return sources::dir_encoder(&table, dim, &registry);
     }
-    // "clip:0123456789abcdef" was made with a network of the family clip.
+    // "clip:0123456789abcdef" names a network of the family clip.
     let source = match space.split_once(':') {
         Some((family, _)) => SourceChoice::named(family),
         None => sources::default::<sources::FeatureSources>(),

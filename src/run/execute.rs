@@ -35,7 +35,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let workspace = Workspace::create(&plan.output.out, plan.output.force, &read)?;
     let known = photos::camera_file(plan).map(cameras::read_file).transpose()?;
     let cloud = plan.inputs.points.as_deref().map(|file| points::read(file, progress)).transpose()?;
-    // The device comes first: it says how large the photos may be.
+    // The device comes first: it limits the size of the photos.
     let device = plan.machine.open(plan.config.training.deterministic)?;
     let max_size = plan.config.training.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let (mut photos, choice) = match &base {
@@ -52,14 +52,15 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
         (known, None) => known.map(CameraOrigin::Known),
     };
     let store = store(plan.output.resume, plan.output.checkpoint_seconds)?;
-    let work = Work { config: &plan.config, queries: &plan.inputs.queries, base: base.as_ref(), origin };
-    let made = work.run(&device, &registry, photos, &store, progress)?;
+    let queries = &plan.inputs.queries;
+    let reconstruction = Reconstruction { config: &plan.config, queries, base: base.as_ref(), origin };
+    let made = reconstruction.run(&device, &registry, photos, &store, progress)?;
     let outcome = RunOutcome { choice, plan: plan.clone(), ..made };
     write(workspace, &outcome, progress)?;
     Ok(outcome)
 }
 
-/// The run without its files, for programs that hold photos, device and models themselves.
+/// Reconstructs without files, for programs that hold photos, device and models themselves.
 pub fn reconstruct(
     config: &ReconstructionConfig,
     extras: &Extras,
@@ -75,22 +76,22 @@ pub fn reconstruct(
     config.check_budget(device, &sizes, usize::MAX)?;
     let paths = photos.iter().map(|p| p.path.clone()).collect();
     let given = (!extras.cameras.is_empty()).then(|| CameraOrigin::Known(extras.cameras.clone().into()));
-    let work = Work { config, queries: &extras.queries, base: None, origin: given };
-    let made = work.run(device, registry, photos, &Store::none(), progress)?;
+    let reconstruction = Reconstruction { config, queries: &extras.queries, base: None, origin: given };
+    let made = reconstruction.run(device, registry, photos, &Store::none(), progress)?;
     let inputs = Inputs { photos: paths, queries: extras.queries.clone(), ..Inputs::default() };
     Ok(RunOutcome { plan: RunPlan { inputs, config: config.clone(), ..RunPlan::default() }, ..made })
 }
 
-/// Writes what [`reconstruct`] made as a scene directory, whole or not at all; `force` replaces a
-/// scene.
+/// Writes the outcome of [`reconstruct`] as a scene directory, whole or not at all; `force`
+/// replaces a scene.
 pub fn save(outcome: &mut RunOutcome, out: &Path, force: bool, progress: &dyn Progress) -> Result<()> {
     let workspace = Workspace::create(out, force, &[])?;
     outcome.plan.output.out = out.to_path_buf();
     write(workspace, outcome, progress)
 }
 
-/// A reconstruction once its photos are read.
-struct Work<'a> {
+/// A reconstruction whose photos are read.
+struct Reconstruction<'a> {
     config: &'a ReconstructionConfig,
     queries: &'a [String],
     base: Option<&'a Arc<BaseScene>>,
@@ -98,7 +99,7 @@ struct Work<'a> {
     origin: Option<CameraOrigin>,
 }
 
-impl Work<'_> {
+impl Reconstruction<'_> {
     fn run(
         self,
         device: &Device,
@@ -107,10 +108,10 @@ impl Work<'_> {
         store: &Store,
         progress: &Recorded,
     ) -> Result<RunOutcome> {
-        let Work { config, queries, base, origin } = self;
-        // Whatever can be refused is read before the long work, not after it.
+        let Reconstruction { config, queries, base, origin } = self;
+        // Everything that can be refused is read before the long stages.
         registry.compute().report(progress)?;
-        let networks = Networks::of(config, registry)?;
+        let networks = Networks::find(config, registry)?;
         networks.warn_untrained(progress);
         graph::check(config, &photos, registry)?;
         let preset = config.preset_on(device);
@@ -177,7 +178,7 @@ impl Work<'_> {
     }
 }
 
-/// What stages made, on disk.
+/// Stage outputs on disk.
 fn store(resume: bool, checkpoint_seconds: u64) -> Result<Store> {
     match stage_folder() {
         Ok(folder) => Ok(Store::at(folder, resume, Duration::from_secs(checkpoint_seconds))),
@@ -186,7 +187,7 @@ fn store(resume: bool, checkpoint_seconds: u64) -> Result<Store> {
     }
 }
 
-/// Where runs keep what their stages made.
+/// Folder where runs keep outputs of their stages.
 pub fn stage_folder() -> Result<PathBuf> {
     Ok(home()?.join("stages"))
 }

@@ -1,4 +1,4 @@
-//! How well a scene shows the photos that it was made from.
+//! PSNR of a scene against the photos that it was made from.
 use super::view::DecodedFrame;
 use crate::fit::MOST_PSNR;
 use crate::pass::metrics;
@@ -8,27 +8,28 @@ use crate::progress::{Progress, Recorded};
 use crate::scene::Coverage;
 use rayon::prelude::*;
 
-/// A photo this much below the best one, dB, is not shown as it should be: half the amplitude of
-/// the error is more than texture makes among photos of one place.
+/// PSNR gap to the best photo, dB, from which a photo is reported. It doubles the error amplitude,
+/// more than texture does among photos of one place.
 const FAR_BELOW: f64 = 6.0;
-/// A photo that is shown this well, dB, is not said to be shown badly, however much better others
-/// are: photos that were added last have seen the fewest steps, and photos that something hides are
-/// at 13 to 25 dB.
+/// PSNR, dB, from which a photo is never reported, however much better others are: photos that were
+/// added last have had the fewest steps, and photos that something hides are at 13 to 25 dB.
 const GOOD: f64 = 30.0;
-/// Photos that come out below this on average, dB, are not what the scene shows: …
+/// Mean PSNR, dB, below which the scene does not reproduce its photos.
 const POOR: f64 = 22.0;
-/// … and below this the scene is of no use, and its cameras are as doubtful.
+/// Mean PSNR, dB, below which the scene is useless and its cameras are as doubtful.
 const BAD: f64 = 18.0;
 
-/// How well the frames of a finished scene show its photos, dB: the language stage has moved its
+/// PSNR of the frames of a finished scene against its photos, dB: the language stage has moved the
 /// splats since the colours were trained.
 pub(super) fn psnr(frames: &[DecodedFrame], photos: &[Photo]) -> Vec<f64> {
-    let one = |(f, p): (&DecodedFrame, &Photo)| {
-        let weights = p.coverage.as_ref().map(Coverage::weights);
-        let counts = |i: usize| weights.as_ref().is_none_or(|w| w.data[i] > 0.0);
-        metrics::psnr_masked(&f.rendered.rgb, &p.target(), counts).min(MOST_PSNR)
-    };
-    frames.par_iter().zip(photos).map(one).collect()
+    frames.par_iter().zip(photos).map(|(frame, photo)| masked_psnr(frame, photo)).collect()
+}
+
+/// PSNR over the used pixels of a photo, dB, at most [`MOST_PSNR`].
+fn masked_psnr(frame: &DecodedFrame, photo: &Photo) -> f64 {
+    let weights = photo.coverage.as_ref().map(Coverage::weights);
+    let is_used = |i: usize| weights.as_ref().is_none_or(|w| w.data[i] > 0.0);
+    metrics::psnr_masked(&frame.rendered.rgb, &photo.target(), is_used).min(MOST_PSNR)
 }
 
 /// Mean over the photos and their range, for the closing table.
@@ -38,8 +39,7 @@ pub(super) fn figure(psnr: &[f64]) -> (String, String) {
     ("train PSNR".to_owned(), text)
 }
 
-/// Warns where the scene shows its photos badly: first of all if that is true of all of them, then
-/// by name.
+/// Warns if the scene shows all of its photos badly, and names single photos that it shows badly.
 pub(super) fn warn(photos: &[Photo], psnr: &[f64], progress: &Recorded) {
     if let Some(text) = warning_about(photos.iter().map(|p| p.stem.as_str()), psnr) {
         progress.warn(&text);
@@ -49,12 +49,12 @@ pub(super) fn warn(photos: &[Photo], psnr: &[f64], progress: &Recorded) {
     }
 }
 
-/// The line that a summary begins with where the scene shows all of its photos badly.
+/// First line of a summary if the scene shows all of its photos badly, else empty.
 pub(super) fn heading(psnr: &[f64]) -> String {
     overall_warning(psnr).map_or_else(String::new, |text| format!("  warning: {text}\n"))
 }
 
-/// Says that the scene shows all of its photos badly, which a comparison among them cannot tell.
+/// Warning for a low mean PSNR, which a comparison among the photos does not find.
 fn overall_warning(psnr: &[f64]) -> Option<String> {
     (ceiling(psnr) < Confidence::High).then(|| {
         format!(
@@ -65,8 +65,7 @@ fn overall_warning(psnr: &[f64]) -> Option<String> {
     })
 }
 
-/// The most confidence in the cameras of a scene that shows its photos so: cameras that are right
-/// show them well.
+/// Highest confidence in the cameras at this PSNR: correct cameras show the photos well.
 pub(super) fn ceiling(psnr: &[f64]) -> Confidence {
     match mean(psnr) {
         _ if psnr.is_empty() => Confidence::High,
@@ -76,7 +75,7 @@ pub(super) fn ceiling(psnr: &[f64]) -> Confidence {
     }
 }
 
-/// Names the photos that the scene shows far worse than the best one.
+/// Warning with the photos that the scene shows far worse than the best one.
 fn warning_about<'a>(names: impl Iterator<Item = &'a str>, psnr: &[f64]) -> Option<String> {
     let (_, best) = range(psnr);
     let poor: Vec<String> = names
@@ -108,7 +107,7 @@ mod tests {
     use crate::scene::RgbImage;
 
     #[test]
-    fn a_hidden_photo_is_named_and_others_are_not() {
+    fn warning_names_only_hidden_photo() {
         let warning = |psnr: [f64; 4]| warning_about(["a", "b", "c", "d"].into_iter(), &psnr);
         assert_eq!(warning([32.0, 30.0, 26.1, 31.0]), None);
         assert_eq!(warning([38.0, 30.1, 36.0, 37.0]), None);
@@ -117,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn photos_all_shown_badly_are_said_so() {
+    fn low_mean_psnr_limits_confidence() {
         assert_eq!(overall_warning(&[25.0, 27.0, 24.0]), None);
         assert_eq!(ceiling(&[25.0, 27.0, 24.0]), Confidence::High);
         let text = overall_warning(&[9.4, 9.6]).unwrap();
@@ -127,7 +126,7 @@ mod tests {
     }
 
     #[test]
-    fn a_photo_is_compared_with_the_frame_of_the_finished_scene() {
+    fn psnr_compares_photo_with_finished_scene() {
         let image = |v: f32| RgbImage { width: 64, height: 64, data: vec![[v; 3]; 4096] };
         let frame = |v: f32| DecodedFrame {
             rendered: RenderedFrame { rgb: image(v), ..RenderedFrame::default() },
@@ -140,7 +139,7 @@ mod tests {
     }
 
     #[test]
-    fn the_figure_states_mean_and_range() {
+    fn figure_states_mean_and_range() {
         assert_eq!(figure(&[32.0, 34.0]).1, "33.00 dB (32.0 to 34.0)");
     }
 }

@@ -49,7 +49,7 @@ pub(super) struct LanguageOutputs {
 }
 
 impl SceneOutputs {
-    /// For [`crate::pipeline::Graph::run`].
+    /// Targets for [`crate::pipeline::Graph::run`].
     pub(super) fn targets(&self) -> Vec<usize> {
         let mut targets =
             vec![self.placed.target(), self.geometry.target(), self.trained.target(), self.up.target()];
@@ -66,7 +66,7 @@ impl SceneOutputs {
     }
 }
 
-/// Refuses, before any work, what a source would refuse later.
+/// Validates the sources before any work.
 pub(super) fn check(config: &ReconstructionConfig, photos: &[Photo], registry: &Registry) -> Result<()> {
     let defaults = LanguageConfig::default();
     let language = config.language.as_ref();
@@ -80,8 +80,8 @@ pub(super) fn check(config: &ReconstructionConfig, photos: &[Photo], registry: &
     sources::check::<MaskSources>(&language.masks, &given, registry)
 }
 
-/// Stages that the language of new photos and of added ones share.
-struct Described {
+/// Encoder and queries, shared by the language stages.
+struct QueryInputs {
     encoder: SharedEncoder,
     queries: Output<Vec<TextQuery>>,
 }
@@ -106,19 +106,19 @@ impl ScenePlan<'_> {
         let up = self.build.graph.add(stages::Upright, (placed, geometry, trained));
         let language = match (&self.config.language, encoder) {
             (Some(language), Some(encoder)) => {
-                // First what can be refused: a phrase that a table of embeddings does not hold.
-                let described = self.described(encoder);
+                // Queries come first: a table of embeddings may lack one of their phrases.
+                let query_inputs = self.query_inputs(encoder);
                 let build = &mut self.build;
                 let masks = sources::make::<MaskSources>(&language.masks, &registry, (build, posed))?;
                 let build = &mut self.build;
                 let matches = sources::make::<MatchSources>(&language.matcher, &registry, (build, posed))?;
-                let regions = stages::RegionFeatures { encoder: described.encoder.clone() };
+                let regions = stages::RegionFeatures { encoder: query_inputs.encoder.clone() };
                 let regions = self.build.graph.add(regions, (placed, masks));
                 let recipe = language.recipe(self.config.training.preset);
-                let (seed, space) = (self.build.seed, described.encoder.space().to_owned());
+                let (seed, space) = (self.build.seed, query_inputs.encoder.space().to_owned());
                 let align = stages::Align { recipe, space, seed };
                 let aligned = self.build.graph.add(align, (regions, matches, geometry));
-                self.language(described, placed, trained, aligned)
+                self.language(query_inputs, placed, trained, aligned)
             }
             _ => None,
         };
@@ -152,7 +152,7 @@ impl ScenePlan<'_> {
         };
         let language = match (&self.config.language, encoder) {
             (Some(language), Some(encoder)) => {
-                let described = self.described(encoder);
+                let query_inputs = self.query_inputs(encoder);
                 let graph = &mut self.build.graph;
                 let new = PosedPhotos {
                     placed: graph.add(stages::OnlyAdded { known }, (placed,)),
@@ -161,13 +161,13 @@ impl ScenePlan<'_> {
                 let build = &mut self.build;
                 let masks = sources::make::<MaskSources>(&language.masks, &registry, (build, new))?;
                 let graph = &mut self.build.graph;
-                let regions = stages::RegionFeatures { encoder: described.encoder.clone() };
+                let regions = stages::RegionFeatures { encoder: query_inputs.encoder.clone() };
                 let regions = graph.add(regions, (new.placed, masks));
                 let recipe = language.recipe(self.config.training.preset);
-                let options = recipe.build(described.encoder.space(), seed);
+                let options = recipe.build(query_inputs.encoder.space(), seed);
                 let align = stages::AlignAdded { base: base.clone(), options };
                 let aligned = graph.add(align, (regions, geometry, trained));
-                self.language(described, placed, trained, aligned)
+                self.language(query_inputs, placed, trained, aligned)
             }
             _ => None,
         };
@@ -186,15 +186,15 @@ impl ScenePlan<'_> {
         self.build.graph.add(stages::ViewDependence { options }, (placed, trained))
     }
 
-    fn described(&mut self, encoder: SharedEncoder) -> Described {
+    fn query_inputs(&mut self, encoder: SharedEncoder) -> QueryInputs {
         let embed = stages::EmbedQueries { encoder: encoder.clone(), texts: self.queries.to_vec() };
-        Described { queries: self.build.graph.add(embed, ()), encoder }
+        QueryInputs { queries: self.build.graph.add(embed, ()), encoder }
     }
 
     /// Adds the stages from aligned codes to answers; `None` without language.
     fn language(
         &mut self,
-        described: Described,
+        query_inputs: QueryInputs,
         placed: Output<PlacedPhotos>,
         trained: Output<Trained>,
         aligned: Output<Language>,
@@ -202,7 +202,7 @@ impl ScenePlan<'_> {
         let config = self.config.language.as_ref()?;
         let (recipe, options) =
             (config.recipe(self.config.training.preset), self.config.language_options(self.build.preset)?);
-        let Described { encoder, queries } = described;
+        let QueryInputs { encoder, queries } = query_inputs;
         let graph = &mut self.build.graph;
         let names = graph.add(stages::NameCodes { encoder }, (aligned,));
         let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));

@@ -1,45 +1,48 @@
-//! The light that was taken out of the photos, in run.json, the report and the closing table.
+//! Photometric correction of the photos, in run.json, the report and the closing table.
 use crate::photo::{Light, Photo};
 use serde_json::{Value, json};
 
-/// Per photo, for run.json; `None` where every photo was left as it is.
+/// Entries of run.json per photo; `None` if no photo was corrected.
 pub(super) fn record(photos: &[Photo]) -> Option<Value> {
-    let one = |p: &Photo| {
-        let Light { gain, falloff, sigma_ev, sigma_corner, unexplained } = p.light;
-        json!({
-            "photo": p.stem, "exposure_ev": p.light.exposure_ev(), "exposure_doubt_ev": sigma_ev,
-            "red_to_green": gain[0] / gain[1], "blue_to_green": gain[2] / gain[1],
-            "corner": p.light.corner(), "corner_doubt": sigma_corner, "gain": gain, "falloff": falloff, "unexplained": unexplained,
-        })
-    };
-    taken(photos).then(|| photos.iter().map(one).collect())
+    any_corrected(photos).then(|| photos.iter().map(light_json).collect())
 }
 
-/// A line of the closing table: the range over the photos.
+fn light_json(photo: &Photo) -> Value {
+    let Light { gain, falloff, sigma_ev, sigma_corner, unexplained } = photo.light;
+    json!({
+        "photo": photo.stem, "exposure_ev": photo.light.exposure_ev(), "exposure_doubt_ev": sigma_ev,
+        "red_to_green": gain[0] / gain[1], "blue_to_green": gain[2] / gain[1],
+        "corner": photo.light.corner(), "corner_doubt": sigma_corner, "gain": gain, "falloff": falloff, "unexplained": unexplained,
+    })
+}
+
+/// Line of the closing table: the range over the photos.
 pub(super) fn figure(photos: &[Photo]) -> Option<(String, String)> {
-    if !taken(photos) {
+    if !any_corrected(photos) {
         return None;
     }
-    let range = |of: &dyn Fn(&Light) -> f64| {
-        let values = photos.iter().map(|p| of(&p.light));
-        values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)))
-    };
-    let (dark, bright) = range(&Light::exposure_ev);
-    let sigma = range(&|l| l.sigma_ev).1;
-    let colour = |k: usize| {
-        let (low, high) = range(&|l| l.white_balance()[k]);
+    let (dark, bright) = range(photos, Light::exposure_ev);
+    let sigma = range(photos, |l| l.sigma_ev).1;
+    let colour_percent = |k: usize| {
+        let (low, high) = range(photos, |l| l.white_balance()[k]);
         100.0 * (high / low - 1.0)
     };
-    let corner = 100.0 * (1.0 - range(&Light::corner).0);
+    let corner = 100.0 * (1.0 - range(photos, Light::corner).0);
     let text = format!(
         "exposures {:.2} ± {sigma:.2} EV apart, colours {:.0} %, corners −{corner:.0} %: evened out",
         bright - dark,
-        colour(0).max(colour(1)),
+        colour_percent(0).max(colour_percent(1)),
     );
     Some(("light".to_owned(), text))
 }
 
-fn taken(photos: &[Photo]) -> bool {
+/// Minimum and maximum of a figure over the photos.
+fn range(photos: &[Photo], figure: impl Fn(&Light) -> f64) -> (f64, f64) {
+    let values = photos.iter().map(|p| figure(&p.light));
+    values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)))
+}
+
+fn any_corrected(photos: &[Photo]) -> bool {
     photos.iter().any(|p| !p.light.is_none())
 }
 
@@ -49,7 +52,7 @@ mod tests {
     use crate::scene::RgbImage;
 
     #[test]
-    fn only_light_that_was_taken_out_is_told() {
+    fn light_is_recorded_only_if_corrected() {
         let image = RgbImage { width: 64, height: 64, data: vec![[0.5; 3]; 64 * 64] };
         let photo = |name: &str| {
             crate::photo::from_pixels(name.as_ref(), &image, None, crate::photo::MAX_SIZE).unwrap()

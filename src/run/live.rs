@@ -1,7 +1,7 @@
-//! A scene that a program holds in memory: rendered, queried and saved on demand. What the C
-//! interface is made of.
+//! A scene that a program holds in memory: rendered, queried and saved on demand. The C interface
+//! is built on it.
 use super::answer::Answers;
-use super::ask::Questions;
+use super::ask::QuerySession;
 use super::compat::{Compat, query_options};
 use super::execute::save;
 use super::outcome::RunOutcome;
@@ -54,10 +54,10 @@ pub struct LiveScene {
     registry: Registry,
     viewer: Viewer,
     options: QueryOptions,
-    /// Opened with the first one.
-    questions: Option<Questions>,
-    /// The last query's camera and what it shows.
-    seen: Option<(Camera, DecodedFrame)>,
+    /// Query state, created by the first query.
+    session: Option<QuerySession>,
+    /// Camera and frame of the last query.
+    last_view: Option<(Camera, DecodedFrame)>,
 }
 
 enum SceneOrigin {
@@ -66,13 +66,13 @@ enum SceneOrigin {
 }
 
 impl LiveScene {
-    /// Loads a scene directory, or a file of Gaussians that has no language. `models` is the folder
-    /// of the models, where the text encoder is taken from; `None` = the default one.
+    /// Loads a scene directory, or a file of Gaussians without language; the text encoder comes
+    /// from `registry`.
     pub fn load(device: &Device, path: &Path, registry: &Registry) -> Result<LiveScene> {
         LiveScene::new(device, SceneOrigin::Loaded(Box::new(scene_dir::load(path)?)), registry)
     }
 
-    /// Takes over what a run made.
+    /// Takes the outcome of a run.
     pub fn trained(device: &Device, outcome: RunOutcome, registry: &Registry) -> Result<LiveScene> {
         LiveScene::new(device, SceneOrigin::Trained(Box::new(outcome)), registry)
     }
@@ -94,12 +94,12 @@ impl LiveScene {
             registry: registry.clone(),
             viewer,
             options: query_options(compat),
-            questions: None,
-            seen: None,
+            session: None,
+            last_view: None,
         })
     }
 
-    /// The device that it is drawn on.
+    /// Device of the scene.
     pub fn device(&self) -> &Device {
         &self.device
     }
@@ -110,66 +110,66 @@ impl LiveScene {
             SceneOrigin::Loaded(s) => &s.splats,
         }
     }
-    /// What the photos show of them.
+    /// Blending weight of the splats in the photos.
     pub fn seen(&self) -> &Seen {
         match &self.origin {
             SceneOrigin::Trained(o) => &o.seen,
             SceneOrigin::Loaded(s) => &s.seen,
         }
     }
-    /// One per photo; none for a bare file.
+    /// Cameras, one per photo; none for a bare file.
     pub fn cameras(&self) -> &[Camera] {
         match &self.origin {
             SceneOrigin::Trained(o) => &o.cameras,
             SceneOrigin::Loaded(s) => &s.cameras,
         }
     }
-    /// Codebooks and features, where the scene has language.
+    /// Codebooks and features; `None` for a scene without language.
     pub fn language(&self) -> Option<&LanguageField> {
         match &self.origin {
             SceneOrigin::Trained(o) => o.language.as_ref().map(|l| &l.field),
             SceneOrigin::Loaded(s) => s.language.as_ref(),
         }
     }
-    /// How the scene lies in the world.
+    /// Direction up and scale.
     pub fn world(&self) -> &World {
         match &self.origin {
             SceneOrigin::Trained(o) => &o.world,
             SceneOrigin::Loaded(s) => &s.world,
         }
     }
-    /// What the run was warned of, or what was left out of a file of Gaussians.
+    /// Warnings of the run, or parts that the reader of a file of Gaussians left out.
     pub fn warnings(&self) -> &[String] {
         match &self.origin {
             SceneOrigin::Trained(o) => &o.warnings,
             SceneOrigin::Loaded(s) => &s.warnings,
         }
     }
-    /// Where [`LiveScene::draw_bands`] renders the features of a level; `None` without codes.
+    /// Place of a level's features in [`LiveScene::draw_bands`]; `None` without codes.
     pub fn features(&self, level: usize) -> Option<FeatureChannels> {
         self.viewer.features(level)
     }
 
-    /// Renders one camera band by band and shows every band while it is on the device:
+    /// Renders one camera band by band and passes each band to `visit` while it is on the device:
     /// [`Viewer::draw_bands`].
     pub fn draw_bands(
         &mut self,
         model: usize,
         camera: &Camera,
-        seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
+        visit: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
     ) -> Result<()> {
         check(camera)?;
-        self.viewer.draw_bands(model, camera, seen)
+        self.viewer.draw_bands(model, camera, visit)
     }
 
-    /// Renders one camera that the device holds at once. The frame stays on the device, and valid
-    /// until the next call.
+    /// Renders one camera whose frame fits on the device. The frame stays on the device and is
+    /// valid until the next call.
     pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
         check(camera)?;
         self.viewer.draw(camera)
     }
 
-    /// Answers a text for the scene and in the view of a camera: the answer has one view.
+    /// Answers a text for the scene and for one view.
     pub fn ask(&mut self, text: &str, camera: &Camera) -> Result<Answers> {
         check(camera)?;
         if self.language().is_none_or(|f| f.levels.iter().all(|l| l.codebook.is_empty())) {
@@ -177,44 +177,44 @@ impl LiveScene {
                 "the scene has no language; only scenes made from photos by a run have it",
             ));
         }
-        let mut questions = match self.questions.take() {
+        let mut session = match self.session.take() {
             Some(ready) => ready,
-            None => self.open_questions()?,
+            None => self.open_session()?,
         };
-        let answers = self.answer(&mut questions, text, camera);
-        self.questions = Some(questions);
+        let answers = self.answer(&mut session, text, camera);
+        self.session = Some(session);
         answers
     }
 
-    /// What is understood of a text.
+    /// The understood part of a text.
     pub fn reading(&mut self, text: &str) -> Result<Reading> {
-        let mut questions = match self.questions.take() {
+        let mut session = match self.session.take() {
             Some(ready) => ready,
-            None => self.open_questions()?,
+            None => self.open_session()?,
         };
-        let reading = questions.reading(text);
-        self.questions = Some(questions);
+        let reading = session.reading(text);
+        self.session = Some(session);
         reading
     }
 
-    fn answer(&mut self, questions: &mut Questions, text: &str, camera: &Camera) -> Result<Answers> {
-        let (camera, frame) = match self.seen.take().filter(|(c, _)| c == camera) {
+    fn answer(&mut self, session: &mut QuerySession, text: &str, camera: &Camera) -> Result<Answers> {
+        let (camera, frame) = match self.last_view.take().filter(|(c, _)| c == camera) {
             Some(same) => same,
             None => (camera.clone(), self.viewer.view(camera)?),
         };
-        // Taken apart, since the viewer is used while the field is read.
+        // Not `self.language()`: the viewer is borrowed mutably while the field is read.
         let field = match &self.origin {
             SceneOrigin::Trained(o) => o.language.as_ref().map(|l| &l.field),
             SceneOrigin::Loaded(s) => s.language.as_ref(),
         };
         let field = field.ok_or_else(no_language)?;
         let views = (std::slice::from_ref(&camera), std::slice::from_ref(&frame));
-        let answers = questions.ask(text, &mut self.viewer, field, views, &self.options);
-        self.seen = Some((camera, frame));
+        let answers = session.ask(text, &mut self.viewer, field, views, &self.options);
+        self.last_view = Some((camera, frame));
         answers
     }
 
-    fn open_questions(&self) -> Result<Questions> {
+    fn open_session(&self) -> Result<QuerySession> {
         let encoder = match &self.origin {
             SceneOrigin::Trained(o) => {
                 let config = o.plan.config.language.as_ref().ok_or_else(no_language)?;
@@ -223,12 +223,12 @@ impl LiveScene {
             SceneOrigin::Loaded(s) => encoder::of_scene(s, self.registry.clone())?,
         };
         let field = self.language().ok_or_else(no_language)?;
-        Questions::open(encoder, self.splats(), field, self.cameras())
+        QuerySession::open(encoder, self.splats(), field, self.cameras())
     }
 
-    /// Writes a file of the kind that its name asks for ([`gaussians::write`]), or a scene
-    /// directory where the name has no ending, ends in a slash or is that of a folder, whole or not
-    /// at all; `replace` allows to replace a scene or file that is there.
+    /// Writes a file of Gaussians in the format of its ending ([`gaussians::write`]), or a scene
+    /// directory if the path has no ending, ends in a slash or is a folder, whole or not at all;
+    /// `replace` allows to replace an existing scene or file.
     pub fn save(&mut self, path: &Path, replace: bool) -> Result<()> {
         if gaussians::is_named(path) {
             self.check_spared(path)?;
@@ -273,10 +273,10 @@ fn no_language() -> Error {
 fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
     let workspace = Workspace::create(path, replace, &[&scene.path])?;
     let folder = scene.path.join("cameras");
-    // A scene without its photos is still whole.
-    let plain = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
+    // A scene without its photos is saved without them.
+    let load_image = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
     let photos = scene_photos::load(&scene.path).ok();
-    let photos = photos.or_else(|| scene.cameras.iter().map(plain).collect()).unwrap_or_default();
+    let photos = photos.or_else(|| scene.cameras.iter().map(load_image).collect()).unwrap_or_default();
     let points = colmap::read_points(&folder.join("colmap")).ok();
     let table = scene.path.join(scene_dir::TEXT_EMBEDDINGS);
     let contents = Contents {
@@ -293,7 +293,7 @@ fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
     workspace.commit().map(drop)
 }
 
-/// Cameras come from outside: refuses what cannot be rendered.
+/// Refuses cameras from outside that cannot be rendered.
 fn check(camera: &Camera) -> Result<()> {
     camera.clone().checked().map(drop).map_err(Error::input)
 }

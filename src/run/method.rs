@@ -1,5 +1,5 @@
 //! The compared methods as configurations of one engine: each shares photos, cameras, stereo points
-//! and every pass with the default, and changes only what its authors do differently to language.
+//! and every pass with the default, and changes only the authors' treatment of language.
 use super::view::Viewer;
 use crate::fit::scale::SceneScale;
 use crate::fit::{self, LanguageOptions, Photos, Preset, RgbOptions, Start, TrainedLanguage, index_head};
@@ -11,15 +11,15 @@ use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
-/// A method of the paper's comparison. All start from dense points of the photos, as the paper's
+/// A method of the paper's comparison. All start from dense points of the photos, like the paper's
 /// "-s" rows.
 #[derive(Debug, PartialEq)]
 pub struct Method {
-    /// As users write it.
+    /// Name on the command line.
     pub name: &'static str,
-    /// What it does, in a line.
+    /// Description in one line.
     pub about: &'static str,
-    /// What it decides, with codes of the length its authors use.
+    /// Choices, with the code length of its authors.
     pub recipe: Recipe,
 }
 
@@ -56,31 +56,31 @@ pub static LEGAUSSIANS: Method = Method {
     recipe: Recipe { reducer: Reducer::Quantised, feature_dim: 8, index_head: true, ..UNALIGNED },
 };
 
-/// In the manner of LSM (Fan et al. 2024; its network is not part of this program): nothing is
-/// optimised for the scene.
+/// After LSM (Fan et al. 2024; its network is not part of this program): no optimisation per scene.
 pub static LSM: Method = Method {
     name: "lsm",
     about: "No alignment, features lifted onto the stereo points in one pass, nothing optimised",
     recipe: Recipe { optimise: false, language: LanguageFit::Lift, ..UNALIGNED },
 };
 
-/// Closed form (Cheng et al. 2024 call it Occam's LGS): the mean of what every splat is seen with.
+/// Closed form (Cheng et al. 2024, Occam's LGS): the blending-weighted mean of the codes that a
+/// splat is seen with.
 pub static LIFT: Method = Method {
     name: "lift",
     about: "Alignment and codes as sparselgs; features are summed and normalised, not trained",
     recipe: Recipe { language: LanguageFit::Lift, ..OURS },
 };
 
-/// What `--method` takes. [`Method::by_default`] is one of the first two.
+/// Values of `--method`. [`Method::by_default`] is one of the first two.
 pub static METHODS: [&Method; 5] = [&SPARSELGS, &LIFT, &LANGSPLAT, &LEGAUSSIANS, &LSM];
 
-/// How splats get their features.
+/// Method that computes the features of the splats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum LanguageFit {
-    /// Training, from where the preset starts.
+    /// Training from the start of the preset.
     Train,
-    /// One pass per photo, sum and normalise.
+    /// One pass per photo: sum and normalise.
     Lift,
 }
 
@@ -98,32 +98,31 @@ const OURS: Recipe = Recipe {
 
 const UNALIGNED: Recipe = Recipe { steps: [false; 3], image_weight: 0.0, features_only: true, ..OURS };
 
-/// What a method decides.
+/// Choices of a method.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Recipe {
     /// Alignment steps 1, 2, 3.
     pub steps: [bool; 3],
-    /// From embeddings to codes.
+    /// Reduction of embeddings to codes.
     pub reducer: Reducer,
     /// Length of the codes.
     pub feature_dim: usize,
-    /// Weight of the photos' loss in the language stage.
+    /// Weight of the photometric loss in the language stage.
     pub image_weight: f64,
     /// Only features move in the language stage.
     pub features_only: bool,
-    /// Train the colours.
+    /// Whether colours are trained.
     pub optimise: bool,
-    /// How splats get their features.
+    /// Method that computes the features of the splats.
     pub language: LanguageFit,
     /// Smooth features in space and train a head that reads the codebook index from them.
     pub index_head: bool,
-    /// Thresholds and conditions of the alignment, of which `steps` leaves out what a method does
-    /// not do.
+    /// Thresholds and conditions of the alignment; `steps` disables the ones that a method lacks.
     pub align: AlignOptions,
 }
 
 impl Method {
-    /// The one of a name.
+    /// Finds a method by name.
     pub fn named(name: &str) -> Result<&'static Method> {
         METHODS.iter().find(|m| m.name == name).copied().ok_or_else(|| {
             let names: Vec<&str> = METHODS.iter().map(|m| m.name).collect();
@@ -131,10 +130,9 @@ impl Method {
         })
     }
 
-    /// What a run does that is asked for no method: training gains nothing over lifted features
-    /// (docs/internals/experiments.md#measured-lifting), so it trains them only where it is asked
-    /// for something of the training: the paper's preset, a number of steps, models of their own
-    /// per level.
+    /// The method of a run that names none. Training gains nothing over lifted features
+    /// (docs/internals/experiments.md#measured-lifting), so features are trained only if a setting
+    /// concerns the training: the paper's preset, a number of steps, or one model per level.
     pub fn by_default(
         preset: Option<Preset>,
         language_iterations: Option<usize>,
@@ -149,7 +147,7 @@ impl Method {
 /// (docs/internals/method.md#code-length).
 pub const FEATURE_DIM: usize = 16;
 
-/// LangSplat trains on the masks of hundreds of photos; 100 epochs of those of a few photos would
+/// LangSplat trains on the masks of hundreds of photos; 100 epochs on those of a few photos would
 /// leave it half trained.
 pub const AUTOENCODER: Reducer = Reducer::Autoencoder { least_steps: 2000 };
 
@@ -157,7 +155,7 @@ pub const AUTOENCODER: Reducer = Reducer::Autoencoder { least_steps: 2000 };
 const IMAGE_WEIGHT: f64 = 0.3;
 
 impl Recipe {
-    /// For [`crate::language::build`].
+    /// Options for [`crate::language::build`].
     pub fn build(&self, space: &str, seed: u64) -> BuildOptions {
         let [matching, fusion, reprojection] = self.steps;
         BuildOptions {
@@ -202,7 +200,7 @@ impl Recipe {
         options.image_weight = self.image_weight;
         options.detach_geometry |= self.features_only;
         if matches!(self.reducer, Reducer::Autoencoder { .. }) {
-            // Decoding every training pixel against 2048 directions takes the processor longer than
+            // Decoding every training pixel against 2048 directions takes longer on the CPU than
             // the training.
             options.check_every = 0;
         }
@@ -214,12 +212,12 @@ impl Recipe {
     }
 }
 
-/// Labelled pixels per view that an index head is trained on: some thousand in all pin its few
-/// hundred numbers.
+/// Labelled pixels per view for the training of an index head: some thousand in all determine its
+/// few hundred parameters.
 const HEAD_SAMPLES: usize = 4000;
 
-/// Smooths the features in space and trains the index head of every level on what the photos' views
-/// then show.
+/// Smooths the features in space and trains the index head of every level on the features rendered
+/// in the photos' views.
 fn train_index_heads(
     device: &Device,
     cameras: &[Camera],
@@ -265,7 +263,7 @@ mod tests {
     use crate::run::LanguageConfig;
 
     #[test]
-    fn features_are_trained_by_default_where_something_of_the_training_is_asked_for() {
+    fn training_settings_select_trained_method() {
         let name = |preset, steps, per_level| Method::by_default(preset, steps, per_level).name;
         assert_eq!(name(None, None, false), "lift");
         assert_eq!(name(Some(Preset::Default), None, false), "lift");
@@ -280,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn sparselgs_changes_nothing_and_each_baseline_what_it_should() {
+    fn recipes_change_only_their_own_choices() {
         let preset = LanguageOptions::preset(Preset::Draft);
         let ours = SPARSELGS.recipe;
         assert_eq!(ours.language(preset.clone()), preset);

@@ -1,9 +1,9 @@
-//! Lengths in a scene, and the scale that a known one gives it (docs/use/metres.md).
+//! Lengths in a scene, and the scale that known lengths give it (docs/use/metres.md).
 use super::view::Viewer;
 use crate::format::scene_dir::Scene;
 use crate::gpu;
 use crate::photo::stem;
-use crate::scene::{Camera, LanguageField, Scale};
+use crate::scene::{Camera, Image, LanguageField, Scale};
 use crate::{Error, Result};
 use glam::{DVec2, DVec3};
 use std::str::FromStr;
@@ -13,21 +13,18 @@ use std::str::FromStr;
 pub enum Place {
     /// `x,y,z` in the scene's own coordinates.
     Point(DVec3),
-    /// `VIEW:x,y`: what a view of the scene shows at a pixel position.
+    /// `VIEW:x,y`: the surface at a pixel of a view.
     Pixel(String, DVec2),
 }
 
 impl Place {
     fn parse(text: &str) -> Option<Place> {
-        let numbers = |text: &str| -> Option<Vec<f64>> {
-            text.split(',').map(|n| n.trim().parse().ok().filter(|v: &f64| v.is_finite())).collect()
-        };
         match text.rsplit_once(':') {
-            Some((view, pixel)) => match numbers(pixel)?[..] {
+            Some((view, pixel)) => match finite_numbers(pixel)?[..] {
                 [x, y] => Some(Place::Pixel(stem(view.trim()).to_owned(), DVec2::new(x, y))),
                 _ => None,
             },
-            None => match numbers(text)?[..] {
+            None => match finite_numbers(text)?[..] {
                 [x, y, z] => Some(Place::Point(DVec3::new(x, y, z))),
                 _ => None,
             },
@@ -35,14 +32,19 @@ impl Place {
     }
 }
 
+/// Parses numbers between commas; `None` unless all are finite.
+fn finite_numbers(text: &str) -> Option<Vec<f64>> {
+    text.split(',').map(|n| n.trim().parse().ok().filter(|v: &f64| v.is_finite())).collect()
+}
+
 /// `A - B`, or with its true length `A - B = 0.21`: metres, or a number with `m`, `cm` or `mm`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Length {
-    /// As it was written.
+    /// Original text.
     pub text: String,
-    /// Its ends.
+    /// Both ends.
     pub ends: [Place; 2],
-    /// If it was stated.
+    /// True length, if stated.
     pub metres: Option<f64>,
 }
 
@@ -54,8 +56,8 @@ impl FromStr for Length {
             Some((places, length)) => (places, Some(metres(length)?)),
             None => (text, None),
         };
-        // A minus may also be a sign, or part of a name: the first one that leaves two places
-        // counts.
+        // A minus can also be a sign or part of a name: the first one between two places separates
+        // them.
         let split =
             |(at, _): (usize, &str)| Some([Place::parse(&places[..at])?, Place::parse(&places[at + 1..])?]);
         let ends = places.match_indices('-').find_map(split).ok_or_else(|| {
@@ -77,27 +79,27 @@ fn metres(text: &str) -> Result<f64, String> {
     })
 }
 
-/// What one photo can tell of a place: a click is right to a pixel …
+/// σ of a clicked position, pixels.
 const CLICK_SIGMA: f64 = 1.0;
-/// … and depth to 1.5 %: then two thirds of 85 lengths between the middles of the things on
+/// Relative σ of depth. With 1.5 % two thirds of 85 lengths between the middles of the things on
 /// `breakfast` err by no more than their stated deviation, half by no more than 0.7 of it.
 const DEPTH_SIGMA: f64 = 0.015;
 
-/// A length as the scene has it.
+/// A length measured in the scene.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Measured {
-    /// Its ends, scene coordinates.
+    /// Both ends, scene coordinates.
     pub ends: [DVec3; 2],
-    /// Scene units.
+    /// Length, scene units.
     pub units: f64,
     /// One standard deviation of `units`.
     pub sigma: f64,
 }
 
-/// Measures lengths; a device is opened where one of them names pixels.
+/// Measures lengths; opens a device if one of them names pixels.
 pub fn measure(scene: &Scene, lengths: &[Length], device: Option<&str>) -> Result<Vec<Measured>> {
     let places = || lengths.iter().flat_map(|l| &l.ends);
-    let mut depths: Vec<(&str, crate::scene::Image<f32>)> = Vec::new();
+    let mut depths: Vec<(&str, Image<f32>)> = Vec::new();
     if places().any(|p| matches!(p, Place::Pixel(..))) {
         let device = gpu::open(device)?;
         let mut viewer = Viewer::new(&device, &scene.splats, &LanguageField::default())?;
@@ -108,39 +110,41 @@ pub fn measure(scene: &Scene, lengths: &[Length], device: Option<&str>) -> Resul
             }
         }
     }
-    let position = |place: &Place| match place {
-        Place::Point(p) => Ok(*p),
-        Place::Pixel(view, pixel) => {
-            let camera = camera(scene, view)?;
-            let (x, y) = (pixel.x.floor(), pixel.y.floor());
-            let inside = x >= 0.0 && y >= 0.0 && x < f64::from(camera.width) && y < f64::from(camera.height);
-            if !inside {
-                return Err(Error::input(format!(
-                    "{view}:{},{}: the view has {} × {} pixels",
-                    pixel.x, pixel.y, camera.width, camera.height
-                )));
-            }
-            let depth = depths.iter().find(|d| d.0 == view).map_or(0.0, |d| d.1.at(x as usize, y as usize));
-            match depth > 0.0 {
-                true => Ok(camera.unproject(*pixel, f64::from(depth))),
-                false => Err(Error::input(format!(
-                    "{view}:{},{}: the scene shows nothing there",
-                    pixel.x, pixel.y
-                ))),
-            }
-        }
+    lengths.iter().map(|length| measure_one(scene, &depths, length)).collect()
+}
+
+/// Measures a length; `depths` holds the rendered depth of every view that it names.
+fn measure_one(scene: &Scene, depths: &[(&str, Image<f32>)], length: &Length) -> Result<Measured> {
+    let ends = [position(scene, depths, &length.ends[0])?, position(scene, depths, &length.ends[1])?];
+    let units = ends[0].distance(ends[1]);
+    if units <= 0.0 {
+        return Err(Error::input(format!("\"{}\": both ends are at one place", length.text)));
+    }
+    let along = (ends[1] - ends[0]) / units;
+    let sigma = position_sigma(scene, ends[0], along).hypot(position_sigma(scene, ends[1], along));
+    Ok(Measured { ends, units, sigma })
+}
+
+/// Scene coordinates of a place.
+fn position(scene: &Scene, depths: &[(&str, Image<f32>)], place: &Place) -> Result<DVec3> {
+    let (view, pixel) = match place {
+        Place::Point(p) => return Ok(*p),
+        Place::Pixel(view, pixel) => (view, pixel),
     };
-    let one = |length: &Length| {
-        let ends = [position(&length.ends[0])?, position(&length.ends[1])?];
-        let units = ends[0].distance(ends[1]);
-        if units <= 0.0 {
-            return Err(Error::input(format!("\"{}\": both ends are at one place", length.text)));
-        }
-        let along = (ends[1] - ends[0]) / units;
-        let sigma = sigma(scene, ends[0], along).hypot(sigma(scene, ends[1], along));
-        Ok(Measured { ends, units, sigma })
-    };
-    lengths.iter().map(one).collect()
+    let camera = camera(scene, view)?;
+    let (x, y) = (pixel.x.floor(), pixel.y.floor());
+    let inside = x >= 0.0 && y >= 0.0 && x < f64::from(camera.width) && y < f64::from(camera.height);
+    if !inside {
+        return Err(Error::input(format!(
+            "{view}:{},{}: the view has {} × {} pixels",
+            pixel.x, pixel.y, camera.width, camera.height
+        )));
+    }
+    let depth = depths.iter().find(|d| d.0 == view).map_or(0.0, |d| d.1.at(x as usize, y as usize));
+    match depth > 0.0 {
+        true => Ok(camera.unproject(*pixel, f64::from(depth))),
+        false => Err(Error::input(format!("{view}:{},{}: the scene shows nothing there", pixel.x, pixel.y))),
+    }
 }
 
 fn camera<'a>(scene: &'a Scene, view: &str) -> Result<&'a Camera> {
@@ -150,19 +154,19 @@ fn camera<'a>(scene: &'a Scene, view: &str) -> Result<&'a Camera> {
     })
 }
 
-/// Standard deviation of a place along a direction, as the nearest camera in front of it sees it; 0
+/// σ of a position along a direction, scene units, from the nearest camera that has it in front; 0
 /// without cameras.
-fn sigma(scene: &Scene, place: DVec3, along: DVec3) -> f64 {
-    let seen = scene.cameras.iter().map(|c| (c, c.project(place).1)).filter(|s| s.1 > 0.0);
-    let Some((camera, depth)) = seen.min_by(|a, b| a.1.total_cmp(&b.1)) else { return 0.0 };
-    let ray = (place - camera.pose.centre()).normalize_or_zero();
-    let deep = ray.dot(along);
-    let across = (1.0 - deep * deep).max(0.0).sqrt();
-    (DEPTH_SIGMA * depth * deep).hypot(CLICK_SIGMA * depth / camera.fx * across)
+fn position_sigma(scene: &Scene, position: DVec3, along: DVec3) -> f64 {
+    let in_front = scene.cameras.iter().map(|c| (c, c.project(position).1)).filter(|s| s.1 > 0.0);
+    let Some((camera, depth)) = in_front.min_by(|a, b| a.1.total_cmp(&b.1)) else { return 0.0 };
+    let ray = (position - camera.pose.centre()).normalize_or_zero();
+    let axial = ray.dot(along);
+    let lateral = (1.0 - axial * axial).max(0.0).sqrt();
+    (DEPTH_SIGMA * depth * axial).hypot(CLICK_SIGMA * depth / camera.fx * lateral)
 }
 
-/// The scale at which lengths are as stated: the mean of what each of them says, weighted by how
-/// surely it says it. Its deviation is at least that by which they disagree.
+/// Scale from the stated lengths: their mean in the log domain, weighted by 1/σ². Its σ grows with
+/// their disagreement.
 pub fn scale(lengths: &[Length], measured: &[Measured]) -> Option<Scale> {
     let stated = || lengths.iter().zip(measured).filter_map(|(l, m)| Some((l, m, l.metres?)));
     let logs: Vec<(f64, f64)> = stated()
@@ -171,8 +175,7 @@ pub fn scale(lengths: &[Length], measured: &[Measured]) -> Option<Scale> {
     let weight: f64 = logs.iter().map(|l| l.1).sum();
     let mean = logs.iter().map(|(log, w)| log * w).sum::<f64>() / weight;
     let misfit: f64 = logs.iter().map(|(log, w)| w * (log - mean).powi(2)).sum();
-    // Birge ratio: as much more than the stated deviations as the lengths differ by more than
-    // these.
+    // Birge ratio: scatter of the lengths over the scatter that their σ predict, at least 1.
     let excess = (misfit / (logs.len().max(2) - 1) as f64).max(1.0);
     (!logs.is_empty()).then(|| Scale {
         metres_per_unit: mean.exp(),
@@ -186,7 +189,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lengths_are_read_as_they_are_written() {
+    fn lengths_parse_all_notations() {
         let point = |x, y, z| Place::Point(DVec3::new(x, y, z));
         let read = |text: &str| text.parse::<Length>();
         let plain = read("0.1,-0.2,1.3 - -0.4,0.5,1 = 0.21").unwrap();
@@ -210,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn the_surest_length_counts_most_and_disagreement_widens() {
+    fn scale_weights_lengths_by_certainty() {
         let length = |metres| Length { metres: Some(metres), ..read("0,0,1 - 1,0,1") };
         fn read(text: &str) -> Length {
             text.parse().unwrap()
@@ -221,7 +224,7 @@ mod tests {
         let two = [measured(2.0, 0.02), measured(1.0, 0.1)];
         let agreeing = scale(&[length(0.5), length(0.25)], &two).unwrap();
         assert!((agreeing.metres_per_unit - 0.25).abs() < 1e-12 && agreeing.log_sigma < 0.01);
-        // 40 % apart, where 10 % was to be expected.
+        // 40 % apart; their σ predict 10 %.
         let apart = scale(&[length(0.5), length(0.35)], &two).unwrap();
         assert!((0.25..0.252).contains(&apart.metres_per_unit) && apart.log_sigma > 0.03, "{apart:?}");
         assert_eq!(scale(&[read("0,0,1 - 1,0,1")], &two[..1]), None);

@@ -1,4 +1,4 @@
-//! The commands that make scenes, as lists of stages, and what is done with a finished one.
+//! Commands that make scenes, as graphs of stages, and uses of a finished scene.
 pub mod answer;
 pub mod ask;
 pub mod base;

@@ -1,4 +1,4 @@
-//! The networks that users bring, as a run uses them: found before any work, named in run.json.
+//! Networks of the user in a run: found before any work, listed in run.json.
 use super::config::ReconstructionConfig;
 use super::sources::{DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, installed};
 use crate::Result;
@@ -11,8 +11,8 @@ use crate::report::ModelUsed;
 pub(super) struct Networks(Vec<Installed>);
 
 impl Networks {
-    /// Finds them all before any work; the error says what is missing.
-    pub(super) fn of(config: &ReconstructionConfig, registry: &Registry) -> Result<Networks> {
+    /// Finds all networks; an error names the missing one.
+    pub(super) fn find(config: &ReconstructionConfig, registry: &Registry) -> Result<Networks> {
         let geometry = &config.geometry;
         let mut found = vec![
             installed::<GeometrySources>(&geometry.init, registry)?,
@@ -26,7 +26,7 @@ impl Networks {
         Ok(Networks(found.into_iter().flatten().collect()))
     }
 
-    /// Their entries in run.json.
+    /// Entries of run.json.
     pub(super) fn used(&self) -> Result<Vec<ModelUsed>> {
         let mut used = Vec::new();
         for model in &self.0 {

@@ -12,7 +12,7 @@ use crate::report::ModelUsed;
 use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, LanguageField, Seen, Splats, World};
 
-/// Everything that a run made; [`crate::report`] turns it into run.json, report.html and the
+/// Everything that a run produced; [`crate::report`] turns it into run.json, report.html and the
 /// summary.
 #[non_exhaustive]
 pub struct RunOutcome {
@@ -22,34 +22,33 @@ pub struct RunOutcome {
     pub preset: Preset,
     /// The device that was used.
     pub device: crate::gpu::DeviceInfo,
-    /// Which photos were used and why, where there were more than wanted.
+    /// Choice of photos with its reasons, if there were more than requested.
     pub choice: Option<pose::choose::Choice>,
     /// Photos at working resolution.
     pub photos: Vec<Photo>,
-    /// Photos whose place could not be found surely.
+    /// Photos that could not be registered reliably.
     pub left_out: Vec<pose::choose::LeftOut>,
-    /// The first so many photos were in the scene already that the others were added to; 0 = no
-    /// scene.
+    /// Number of leading photos that an extended scene already had; 0 for a new scene.
     pub known: usize,
     /// Geometry before training.
     pub geometry: Geometry,
     /// Refined cameras.
     pub cameras: Vec<Camera>,
-    /// Which way is up, as far as that was found.
+    /// Direction up and scale, as far as known.
     pub world: World,
     /// The scene.
     pub splats: Splats,
-    /// What the photos show of it.
+    /// Blending weight of the splats in the photos.
     pub seen: Seen,
-    /// Figures of the colour stage.
+    /// Statistics of the colour stage.
     pub rgb: fit::FitStats,
     /// PSNR of the finished scene against every photo, dB.
     pub psnr: Vec<f64>,
-    /// The trained scene seen from every photo's camera.
+    /// The finished scene rendered from every photo's camera.
     pub frames: Vec<DecodedFrame>,
     /// The scene's language; `None` for a scene of colours alone.
     pub language: Option<LanguageOutcome>,
-    /// What computed the networks.
+    /// Execution provider of the networks.
     pub provider: Option<&'static str>,
     /// Built-in models.
     pub models: Vec<crate::infer::ModelStatus>,
@@ -57,9 +56,9 @@ pub struct RunOutcome {
     pub networks: Vec<ModelUsed>,
     /// Times and memory per stage, up to the writing of the scene.
     pub stages: Vec<StageRecord>,
-    /// Wall seconds up to there; less than the stages together, since some overlap.
+    /// Wall-clock seconds up to there; less than the sum of the stages, since some overlap.
     pub seconds: f64,
-    /// What the user was warned of.
+    /// Warnings to the user.
     pub warnings: Vec<String>,
 }
 
@@ -68,12 +67,12 @@ pub struct RunOutcome {
 pub struct LanguageOutcome {
     /// Codes and features.
     pub field: LanguageField,
-    /// Masks, edges and components behind it.
+    /// Masks, edges and components.
     pub alignment: language::align::Alignment,
     /// Decode accuracy over the language stage.
     pub curve: Vec<fit::LanguagePoint>,
-    /// One per query of the plan.
+    /// Answers, one per query of the plan.
     pub answers: Vec<Answers>,
-    /// The text model's own phrases per level and code.
+    /// Phrases of the text model per level and code.
     pub names: CodeNames,
 }

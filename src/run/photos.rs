@@ -9,8 +9,8 @@ use crate::progress::Progress;
 use crate::{Error, Result, files};
 use std::path::{Path, PathBuf};
 
-/// Reads the photos of a plan, as many as are wanted; of photos with `known` cameras those that
-/// have one.
+/// Reads the photos of a plan, as many as requested; with `known` cameras only photos that have
+/// one.
 pub(super) fn load(
     plan: &RunPlan,
     known: Option<&CameraFile>,
@@ -37,7 +37,7 @@ pub(super) fn load(
     Ok((photo::load_each(&files, max_size, progress)?, choice))
 }
 
-/// Reads the photos that join a scene, all that were named.
+/// Reads all named photos that join a scene.
 pub(super) fn joining(
     plan: &RunPlan,
     base: &BaseScene,
@@ -56,8 +56,7 @@ pub(super) fn joining(
     found.photos.iter().try_for_each(|p| photo::check_name(p))?;
     let mut files: Vec<Candidate> = found.photos.iter().map(|p| Candidate::file(p)).collect();
     photo::assign_masks(&mut files, &masks(plan)?, progress)?;
-    // As large as those of the scene, where nothing else is asked for: finer ones would be shown no
-    // better.
+    // The default size is that of the scene's photos: finer ones would be shown no better.
     let sides = base.known.photos.iter().map(|p| p.image.width.max(p.image.height));
     let max_size = plan.config.training.max_size.or(sides.max()).unwrap_or(max_size);
     let sizes = base.known.photos.iter().map(|p| (p.image.width, p.image.height));
@@ -72,7 +71,7 @@ pub(super) fn joining(
     }
     progress.end();
     photo::cut_bars(&mut photos, progress);
-    let mut photos = base.without_its_own(photos, progress)?;
+    let mut photos = base.without_known(photos, progress)?;
     photo::settle(&mut photos, &base.known.photos, progress);
     base.check(&photos)?;
     Ok(photos)
@@ -89,8 +88,8 @@ fn masks(plan: &RunPlan) -> Result<MaskChoice> {
     cameras::masks(plan.inputs.photo_masks.as_deref(), camera_file(plan))
 }
 
-/// The photos of the folder, and of the folders below it that names of cameras lie in, that have a
-/// camera.
+/// Photos with a camera in the input folder and in the folders below it that names of cameras
+/// contain.
 fn with_cameras(plan: &RunPlan, known: &CameraFile, progress: &dyn Progress) -> Result<Vec<Candidate>> {
     let inputs = &plan.inputs.photos;
     let names: Vec<&str> = known.cameras.iter().map(|c| c.camera.name.as_str()).collect();
@@ -109,8 +108,8 @@ fn with_cameras(plan: &RunPlan, known: &CameraFile, progress: &dyn Progress) -> 
     let file = camera_file(plan).unwrap_or(Path::new("")).display();
     let own = photo::join(&paths, &names).map_err(|e| Error::input(format!("{file}: {e}")))?;
     let (with, without): (Vec<_>, Vec<_>) = found.photos.iter().zip(own).partition(|(_, own)| own.is_some());
-    let shown = |list: &[(&PathBuf, Option<usize>)]| {
-        files::listed(&list.iter().map(|(p, _)| within(p, inputs)).collect::<Vec<_>>())
+    let listing = |list: &[(&PathBuf, Option<usize>)]| {
+        files::listed(&list.iter().map(|(p, _)| relative_path(p, inputs)).collect::<Vec<_>>())
     };
     if with.len() < 2 {
         return Err(Error::input(format!(
@@ -119,7 +118,7 @@ fn with_cameras(plan: &RunPlan, known: &CameraFile, progress: &dyn Progress) -> 
             with.len(),
             found.photos.len(),
             file,
-            shown(&found.photos.iter().map(|p| (p, None)).collect::<Vec<_>>()),
+            listing(&found.photos.iter().map(|p| (p, None)).collect::<Vec<_>>()),
             files::listed(&names)
         )));
     }
@@ -127,7 +126,7 @@ fn with_cameras(plan: &RunPlan, known: &CameraFile, progress: &dyn Progress) -> 
         progress.warn(&format!(
             "{} photos have no camera and are left out: {}",
             without.len(),
-            shown(&without)
+            listing(&without)
         ));
     }
     let paths: Vec<String> = with.iter().map(|(p, _)| p.to_string_lossy().into_owned()).collect();
@@ -136,8 +135,8 @@ fn with_cameras(plan: &RunPlan, known: &CameraFile, progress: &dyn Progress) -> 
     Ok(files.collect())
 }
 
-/// A path below the folder that was named.
-fn within(path: &Path, inputs: &[PathBuf]) -> String {
+/// A path relative to its input folder.
+fn relative_path(path: &Path, inputs: &[PathBuf]) -> String {
     let below = inputs.iter().find_map(|folder| path.strip_prefix(folder).ok());
     below.filter(|p| !p.as_os_str().is_empty()).unwrap_or(path).display().to_string()
 }

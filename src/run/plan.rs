@@ -11,15 +11,15 @@ use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
-/// Training states are some ten megabytes for scenes of a few photos: written in a fraction of a
-/// second.
+/// Default of `checkpoint_seconds`. Training states are some ten megabytes for scenes of a few
+/// photos, written in a fraction of a second.
 pub const CHECKPOINT_SECONDS: u64 = 30;
 
 /// A run from files to a scene directory.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct RunPlan {
-    /// Files that the run reads, and questions.
+    /// Files that the run reads, and texts of queries.
     #[serde(flatten)]
     pub inputs: Inputs,
     /// Settings that change the result.
@@ -33,7 +33,7 @@ pub struct RunPlan {
     pub output: Destination,
 }
 
-/// Files that a run reads, and questions.
+/// Files that a run reads, and texts of queries.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Inputs {
@@ -50,7 +50,7 @@ pub struct Inputs {
     /// Points to start from (`.ply`, a COLMAP model folder or a data set that holds one), in the
     /// frame of the cameras of `init`, instead of those of stereo.
     pub points: Option<PathBuf>,
-    /// Texts to answer once the scene is there.
+    /// Texts to answer in the finished scene.
     pub queries: Vec<String>,
 }
 
@@ -71,12 +71,12 @@ pub struct Machine {
     pub device: Option<String>,
     /// Folder of the models.
     pub models: Option<PathBuf>,
-    /// Execution provider of the networks, one of [`crate::infer::provider::NAMES`]; `None` = see
+    /// Execution provider of the networks, one of [`crate::infer::provider::NAMES`]; `None` as in
     /// [`Compute::by`].
     pub provider: Option<String>,
 }
 
-/// Place of the scene, and use of stages that an earlier run left.
+/// Place of the scene, and use of stages of an earlier run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Destination {
@@ -102,7 +102,7 @@ impl Default for Destination {
 }
 
 impl Inputs {
-    /// Refuses questions that cannot be asked.
+    /// Refuses texts that are no queries.
     pub fn check(&self) -> Result<()> {
         self.queries
             .iter()

@@ -1,4 +1,4 @@
-//! A start from given points instead of stereo.
+//! Given points as a start, instead of stereo.
 use crate::format::ply;
 use crate::format::{CameraFile, colmap};
 use crate::photo::Photo;
@@ -8,7 +8,7 @@ use crate::scene::{Camera, PointCloud};
 use crate::{Error, Result};
 use std::path::Path;
 
-/// Geometry of given cameras and points; the lenses are taken out of the photos.
+/// Builds the geometry of given cameras and points; removes the distortion of the photos.
 pub(super) fn geometry(
     photos: &mut [Photo],
     known: &CameraFile,
@@ -29,7 +29,7 @@ pub(super) fn geometry(
     })
 }
 
-/// Points of a `.ply`, a COLMAP model folder or a data set that holds one.
+/// Reads points of a `.ply`, a COLMAP model folder or a data set that holds one.
 pub(super) fn read(path: &Path, progress: &dyn Progress) -> Result<PointCloud> {
     if path.is_dir() {
         return colmap::read_points(path);
@@ -39,40 +39,39 @@ pub(super) fn read(path: &Path, progress: &dyn Progress) -> Result<PointCloud> {
     Ok(points)
 }
 
-/// Gives points from a file the footprint that initialisation needs: `z / f` in the camera that
-/// sees them nearest.
-fn with_footprints(mut cloud: PointCloud, list: &[Camera], progress: &dyn Progress) -> Result<PointCloud> {
-    let mut keep = PointCloud::default();
-    // What is not finite would spread in training.
-    let finite = |i: &usize| cloud.positions[*i].iter().chain(&cloud.colours[*i]).all(|v| v.is_finite());
-    let bad = cloud.len() - (0..cloud.len()).filter(finite).count();
-    if bad > 0 {
+/// Sets the footprint that initialisation needs: `z / f` in the camera that sees the point nearest.
+/// Points outside all cameras are dropped.
+fn with_footprints(cloud: PointCloud, cameras: &[Camera], progress: &dyn Progress) -> Result<PointCloud> {
+    let mut kept = PointCloud::default();
+    // Values that are not finite would spread in training.
+    let is_finite = |i: &usize| cloud.positions[*i].iter().chain(&cloud.colours[*i]).all(|v| v.is_finite());
+    let dropped = cloud.len() - (0..cloud.len()).filter(is_finite).count();
+    if dropped > 0 {
         progress.warn(&format!(
-            "--points: {bad} of {} points are left out: they have numbers that are not finite",
+            "--points: {dropped} of {} points are left out: they have numbers that are not finite",
             cloud.len()
         ));
     }
-    for i in (0..cloud.len()).filter(finite) {
+    for i in (0..cloud.len()).filter(is_finite) {
         let p = glam::Vec3::from_array(cloud.positions[i]).as_dvec3();
-        let seen = list.iter().enumerate().filter_map(|(v, c)| {
+        let footprints = cameras.iter().enumerate().filter_map(|(v, c)| {
             let (pixel, z) = c.project(p);
             let inside =
                 pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < c.width as f64 && pixel.y < c.height as f64;
             (z > 0.0 && inside).then_some((v, (z / c.fx) as f32))
         });
-        if let Some((view, radius)) = seen.min_by(|a, b| a.1.total_cmp(&b.1)) {
-            keep.positions.push(cloud.positions[i]);
-            keep.colours.push(cloud.colours[i]);
-            keep.confidence.push(cloud.confidence[i]);
-            keep.view.push(view as u8);
-            keep.radius.push(radius);
+        if let Some((view, radius)) = footprints.min_by(|a, b| a.1.total_cmp(&b.1)) {
+            kept.positions.push(cloud.positions[i]);
+            kept.colours.push(cloud.colours[i]);
+            kept.confidence.push(cloud.confidence[i]);
+            kept.view.push(view as u8);
+            kept.radius.push(radius);
         }
     }
-    std::mem::swap(&mut cloud, &mut keep);
-    if cloud.is_empty() {
+    if kept.is_empty() {
         return Err(Error::input(
             "--points: no point with a colour is seen by any camera; are both in the same coordinates?",
         ));
     }
-    Ok(cloud)
+    Ok(kept)
 }

@@ -1,7 +1,6 @@
-//! `run.json`: what a run was asked for, did and measured, with types to write it and to read it
-//! back.
+//! `run.json`: request, course and figures of a run, with types to write it and to read it back.
 use super::answer::Answers;
-use super::outcome::RunOutcome;
+use super::outcome::{LanguageOutcome, RunOutcome};
 use super::plan::RunPlan;
 use super::summary::confidence;
 use crate::fit::{self, CurvePoint, LanguagePoint, Preset};
@@ -18,7 +17,7 @@ use std::path::Path;
 /// The content of `run.json`.
 pub type RunRecord = report::RunRecord<ConfigRecord, Statistics>;
 
-/// The run as it was asked for, and the choices that were left to the device.
+/// The run as requested, with the choices that were left to the device.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct ConfigRecord {
@@ -53,7 +52,7 @@ pub struct GeometryRecord {
     pub focal_px: Vec<f64>,
     /// One standard deviation of ln f, where it was estimated.
     pub focal_log_sigma: Option<f64>,
-    /// Per photo with estimated intrinsics.
+    /// One entry per photo with estimated intrinsics.
     pub optics: Vec<IntrinsicsRecord>,
 }
 
@@ -77,13 +76,13 @@ pub struct IntrinsicsRecord {
     pub sigma: SigmaRecord,
     /// Median reprojection error, working pixels.
     pub residual_px: f64,
-    /// Share of the inliers of two-view geometries that agree with the cameras.
+    /// Share of the two-view inliers that agree with the cameras.
     pub agreement: f64,
     /// Camera id; photos of one id share intrinsics.
     pub camera: usize,
     /// One standard deviation of the rotation against the first photo.
     pub rotation_sigma_degrees: f64,
-    /// Trust in the camera.
+    /// Confidence in the camera.
     pub confidence: Option<Confidence>,
 }
 
@@ -91,21 +90,20 @@ pub struct IntrinsicsRecord {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct SigmaRecord {
-    /// Of ln f.
+    /// σ of ln f.
     pub log_focal: f64,
-    /// Of k1.
+    /// σ of k1.
     pub k1: f64,
-    /// Of k2.
+    /// σ of k2.
     pub k2: f64,
-    /// Of the principal point, x, pixels of the file.
+    /// σ of the principal point's x, pixels of the file.
     pub cx: f64,
-    /// Of the principal point, y.
+    /// σ of the principal point's y, pixels of the file.
     pub cy: f64,
 }
 
-/// The record of a finished run, with the paths as they were typed.
+/// Builds the record of a finished run, with the paths as typed.
 pub fn run_record(o: &RunOutcome) -> RunRecord {
-    let used = |m: &&ModelStatus| m.installed;
     let mut plan = o.plan.clone();
     let preset = plan.config.training.preset;
     if let Some(language) = &mut plan.config.language {
@@ -121,7 +119,7 @@ pub fn run_record(o: &RunOutcome) -> RunRecord {
         models: o
             .models
             .iter()
-            .filter(used)
+            .filter(|m: &&ModelStatus| m.installed)
             .map(|m| ModelUsed { name: m.name.clone(), sha256: m.sha256.clone(), licence: m.licence.clone() })
             .chain(o.networks.iter().cloned())
             .collect(),
@@ -135,7 +133,7 @@ pub fn run_record(o: &RunOutcome) -> RunRecord {
 /// Reads `run.json` of a scene directory; `remedy` ends the message of an error.
 ///
 /// # Errors
-/// A file that is missing, or no record of a run.
+/// A missing file, or one without a run record.
 pub fn read(scene: &Path, remedy: &str) -> Result<RunRecord> {
     let path = scene.join("run.json");
     if !path.is_file() {
@@ -146,14 +144,7 @@ pub fn read(scene: &Path, remedy: &str) -> Result<RunRecord> {
 
 fn statistics(o: &RunOutcome) -> Statistics {
     let language = o.language.as_ref();
-    let level = |(at, (name, level)): (usize, (&&str, &crate::scene::LevelField))| {
-        json!({
-            "level": name, "codes": level.codebook.len(), "min_chord": level.codebook.min_chord,
-            "decode_accuracy": fit::decode_accuracy(language.map_or(&[], |l| &l.curve), at),
-        })
-    };
-    let levels = language.map_or(&[][..], |l| &l.field.levels);
-    let levels: Vec<Value> = LEVEL_NAMES.iter().zip(levels).enumerate().map(level).collect();
+    let levels: Vec<Value> = language.map_or_else(Vec::new, levels_json);
     let answers = language.map_or(&[][..], |l| &l.answers);
     let other = json!({
         "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
@@ -186,83 +177,98 @@ fn statistics(o: &RunOutcome) -> Statistics {
     Statistics { geometry, other }
 }
 
-/// What is known of the photos that joined a scene; `None` where the scene is a new one.
-fn added(o: &RunOutcome) -> Option<serde_json::Value> {
-    let one = |v: usize| {
-        let fitted = &o.geometry.fitted[v];
-        json!({
-            "photo": o.photos[v].stem, "confidence": confidence(fitted, &o.psnr), "agreement": fitted.agreement,
-            "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(), "psnr": o.psnr.get(v),
+fn levels_json(language: &LanguageOutcome) -> Vec<Value> {
+    let levels = LEVEL_NAMES.iter().zip(&language.field.levels).enumerate();
+    levels
+        .map(|(index, (name, level))| {
+            json!({
+                "level": name, "codes": level.codebook.len(), "min_chord": level.codebook.min_chord,
+                "decode_accuracy": fit::decode_accuracy(&language.curve, index),
+            })
         })
-    };
+        .collect()
+}
+
+/// Figures of the photos that joined a scene; `None` for a new scene.
+fn added(o: &RunOutcome) -> Option<serde_json::Value> {
     let scene = o.plan.inputs.add.as_ref()?;
-    let photos: Vec<_> = (o.known..o.photos.len()).map(one).collect();
+    let photos: Vec<_> = (o.known..o.photos.len()).map(|view| added_photo(o, view)).collect();
     Some(json!({ "scene": scene.display().to_string(), "photos": photos }))
 }
 
+fn added_photo(o: &RunOutcome, view: usize) -> Value {
+    let fitted = &o.geometry.fitted[view];
+    json!({
+        "photo": o.photos[view].stem, "confidence": confidence(fitted, &o.psnr), "agreement": fitted.agreement,
+        "rotation_sigma_degrees": fitted.rotation_sigma.to_degrees(), "psnr": o.psnr.get(view),
+    })
+}
+
 fn intrinsics(o: &RunOutcome) -> Vec<IntrinsicsRecord> {
-    let one = |((photo, camera), fitted): ((&Photo, &Camera), &Fitted)| {
-        let taken = photo.original_camera(camera);
-        let [log_focal, k1, k2, cx, cy] = fitted.sigmas;
-        IntrinsicsRecord {
-            photo: photo.stem.clone(),
-            focal_px: taken.fx,
-            cx: taken.cx,
-            cy: taken.cy,
-            k1: fitted.lens.k1,
-            k2: fitted.lens.k2,
-            sigma: SigmaRecord { log_focal, k1, k2, cx, cy },
-            residual_px: fitted.residual,
-            agreement: fitted.agreement,
-            camera: fitted.camera,
-            rotation_sigma_degrees: fitted.rotation_sigma.to_degrees(),
-            confidence: Some(confidence(fitted, &o.psnr)),
-        }
-    };
-    o.photos.iter().zip(&o.cameras).zip(&o.geometry.fitted).map(one).collect()
+    let photos = o.photos.iter().zip(&o.cameras).zip(&o.geometry.fitted);
+    photos.map(|((photo, camera), fitted)| intrinsics_of(photo, camera, fitted, &o.psnr)).collect()
+}
+
+fn intrinsics_of(photo: &Photo, camera: &Camera, fitted: &Fitted, psnr: &[f64]) -> IntrinsicsRecord {
+    let original = photo.original_camera(camera);
+    let [log_focal, k1, k2, cx, cy] = fitted.sigmas;
+    IntrinsicsRecord {
+        photo: photo.stem.clone(),
+        focal_px: original.fx,
+        cx: original.cx,
+        cy: original.cy,
+        k1: fitted.lens.k1,
+        k2: fitted.lens.k2,
+        sigma: SigmaRecord { log_focal, k1, k2, cx, cy },
+        residual_px: fitted.residual,
+        agreement: fitted.agreement,
+        camera: fitted.camera,
+        rotation_sigma_degrees: fitted.rotation_sigma.to_degrees(),
+        confidence: Some(confidence(fitted, psnr)),
+    }
 }
 
 impl RunRecord {
-    /// How the camera of a photo was found; where that was not estimated, cameras were given and
-    /// stand.
+    /// Fit of a photo's camera; a camera without estimated intrinsics was given and counts as
+    /// exact.
     pub(super) fn fitted(&self, stem: &str) -> Fitted {
-        let Some(own) = self.statistics.geometry.optics.iter().find(|o| o.photo == stem) else {
+        let Some(record) = self.statistics.geometry.optics.iter().find(|o| o.photo == stem) else {
             return Fitted { agreement: 1.0, ..Fitted::default() };
         };
-        let SigmaRecord { log_focal, k1, k2, cx, cy } = own.sigma;
+        let SigmaRecord { log_focal, k1, k2, cx, cy } = record.sigma;
         Fitted {
-            lens: Lens::radial(own.k1, own.k2),
+            lens: Lens::radial(record.k1, record.k2),
             sigmas: [log_focal, k1, k2, cx, cy],
-            residual: own.residual_px,
-            agreement: own.agreement,
-            // What else makes a place doubtful is not recorded by itself.
-            unconfirmed: own.confidence == Some(Confidence::Low),
-            rotation_sigma: own.rotation_sigma_degrees.to_radians(),
-            camera: own.camera,
+            residual: record.residual_px,
+            agreement: record.agreement,
+            // Other reasons for doubt are not recorded separately.
+            unconfirmed: record.confidence == Some(Confidence::Low),
+            rotation_sigma: record.rotation_sigma_degrees.to_radians(),
+            camera: record.camera,
         }
     }
 }
 
-/// Figures over the steps of the colour stage and, where there was one, of the language stage.
+/// Curves over the steps of the colour stage and of the language stage, if there was one.
 pub(super) fn curves(o: &RunOutcome) -> Vec<Curve> {
     let (rgb, language) = (&o.rgb, o.language.as_ref().map_or(&[][..], |l| &l.curve));
-    let colour = |name, unit, get: fn(&CurvePoint) -> f64| Curve {
+    let colour_curve = |name, unit, get: fn(&CurvePoint) -> f64| Curve {
         name,
         unit,
         points: rgb.curve.iter().map(|p| (p.step as f64, get(p))).collect(),
     };
-    let words = |name, unit, get: fn(&LanguagePoint) -> Option<f64>| {
+    let language_curve = |name, unit, get: fn(&LanguagePoint) -> Option<f64>| {
         let points = language.iter().filter_map(|p| Some((p.step as f64, get(p)?)));
         Curve { name, unit, points: points.collect() }
     };
     vec![
-        colour("loss", "", |p| p.loss),
-        colour("PSNR of render and photo", "dB", |p| p.psnr),
-        colour("SSIM of render and photo", "", |p| p.ssim),
-        colour("splats", "", |p| p.splats as f64),
-        // The first measurement of a model comes before any step, and so before any loss.
-        words("language loss", "", |p| (p.loss > 0.0).then_some(p.loss)),
-        words("pixels that decode to their label", "%", |p| Some(100.0 * p.mean_accuracy())),
+        colour_curve("loss", "", |p| p.loss),
+        colour_curve("PSNR of render and photo", "dB", |p| p.psnr),
+        colour_curve("SSIM of render and photo", "", |p| p.ssim),
+        colour_curve("splats", "", |p| p.splats as f64),
+        // The first measurement of a model precedes every step and has no loss.
+        language_curve("language loss", "", |p| (p.loss > 0.0).then_some(p.loss)),
+        language_curve("pixels that decode to their label", "%", |p| Some(100.0 * p.mean_accuracy())),
     ]
 }
 
@@ -284,7 +290,7 @@ fn answer_json(a: &Answers, o: &RunOutcome) -> serde_json::Value {
     entry
 }
 
-/// Per photo its working and its original (width, height).
+/// Working and original (width, height) per photo.
 fn working_sizes(photos: &[Photo]) -> serde_json::Value {
     let size = |p: &Photo| json!({ "working": [p.image.width, p.image.height], "original": [p.original_size.0, p.original_size.1] });
     photos.iter().map(size).collect()
@@ -297,7 +303,7 @@ mod tests {
     use crate::run::{LanguageConfig, ReconstructionConfig};
 
     #[test]
-    fn record_is_read_back_whole() {
+    fn record_survives_json_round_trip() {
         let mut plan = RunPlan::default();
         plan.inputs.photos = vec!["a.jpg".into()];
         plan.config.training.seed = 7;

@@ -1,6 +1,5 @@
-//! Cameras of held-out photos refined against a finished scene, as evaluations of methods without
-//! known poses do: the scene is frozen, only the camera moves, until its render is closest to the
-//! photo.
+//! Refinement of held-out cameras against a finished scene, as in evaluations of methods without
+//! known poses: the scene is frozen, and the camera moves until its render is closest to the photo.
 use crate::Result;
 use crate::fit::pose::PoseAdam;
 use crate::fit::scale::SceneScale;
@@ -15,16 +14,16 @@ use crate::pose::numeric::rotation_angle;
 use crate::progress::Progress;
 use crate::scene::{Camera, Pose, RgbImage, Splats};
 
-/// Weights of L1 and 1 − SSIM: those of training (Kerbl et al. 2023).
+/// Weights of L1 and 1 − SSIM, as in training (Kerbl et al. 2023).
 const WEIGHTS: [f64; 2] = [0.8, 0.2];
 
 /// (divisor of the size, steps, first and last rate in radians). At half size a render costs a
-/// third and the photo's blur widens the reach to several pixels; the last steps at full size
-/// settle a tenth of a pixel. All steps together can turn a camera by 1.9 degrees about each axis:
-/// an error beyond that is no residue of an alignment.
+/// third and the photo's blur widens the basin of convergence to several pixels; the last steps at
+/// full size settle a tenth of a pixel. All steps together can turn a camera by 1.9 degrees about
+/// each axis: a larger error is no residue of an alignment.
 const LEVELS: [(u32, usize, f64, f64); 2] = [(2, 60, 1e-3, 2e-4), (1, 25, 3e-4, 3e-5)];
 
-/// Moves cameras before a frozen scene.
+/// Refines cameras against a frozen scene.
 pub struct ViewRefiner {
     device: Device,
     params: SplatBuffers,
@@ -33,19 +32,19 @@ pub struct ViewRefiner {
     means: Vec<[f32; 3]>,
 }
 
-/// A camera that was moved, and how far.
+/// A refined camera, with its displacement.
 #[derive(Clone, Debug)]
 pub struct RefinedCamera {
-    /// The camera.
+    /// Refined camera.
     pub camera: Camera,
-    /// Turn, degrees.
+    /// Rotation from the given camera, degrees.
     pub rotation_degrees: f64,
-    /// Shift of its centre over the median depth.
+    /// Displacement of the centre over the median depth.
     pub centre_fraction: f64,
 }
 
 impl ViewRefiner {
-    /// Uploads a scene; its language plays no part.
+    /// Uploads a scene without its language.
     pub fn new(device: &Device, splats: &Splats) -> Result<ViewRefiner> {
         let params = SplatBuffers::upload(device, splats, &[], 0)?;
         Ok(ViewRefiner {
@@ -57,7 +56,8 @@ impl ViewRefiner {
         })
     }
 
-    /// The camera that shows the photo best, near the given one; sizes are those of the photo.
+    /// Returns the camera near the given one that shows the photo best; sizes are those of the
+    /// photo.
     pub fn refine(
         &self,
         camera: &Camera,
@@ -70,10 +70,10 @@ impl ViewRefiner {
         let mut pose = camera.pose;
         for (divisor, steps, first, last) in LEVELS {
             let size = [camera.width, camera.height].map(|s| s.div_ceil(divisor));
-            let at = Camera { pose, ..camera.resized(size[0], size[1]) };
+            let scaled = Camera { pose, ..camera.resized(size[0], size[1]) };
             let image = photo.resized_by_area(size[0] as usize, size[1] as usize);
             let rate = Exponential { start: first, end: last, steps };
-            pose = self.descend(&at, &image, (steps, rate), &scale, progress)?;
+            pose = self.descend(&scaled, &image, (steps, rate), &scale, progress)?;
         }
         let turn = pose.compose(&camera.pose.inverse()).rotation;
         Ok(RefinedCamera {
@@ -83,7 +83,7 @@ impl ViewRefiner {
         })
     }
 
-    /// The pose of least loss among those that gradient steps at one size visit.
+    /// Runs gradient descent at one size; returns the visited pose with the least loss.
     fn descend(
         &self,
         camera: &Camera,
@@ -93,7 +93,7 @@ impl ViewRefiner {
         progress: &dyn Progress,
     ) -> Result<Pose> {
         let mut raster = Rasterizer::new(&self.device, self.params.count, 0, camera.width, camera.height)?;
-        // An image that the device holds only in parts is left at what the coarser level found.
+        // An image that needs several bands keeps the pose of the coarser level.
         let bands = raster.frame().bands.clone();
         if bands.count() > 1 {
             return Ok(camera.pose);
@@ -155,32 +155,32 @@ impl ViewRefiner {
     }
 }
 
-/// The photo in the light of the scene: per channel the mean and the spread of what the rasteriser
-/// shows, so that exposure and white balance do not pull at the camera. Where the scene shows
-/// nothing, there is nothing to compare either.
+/// Photo with the exposure and white balance of the scene: mean and deviation of every channel are
+/// those of the render. Pixels that the scene does not cover are those of the render.
 fn target(photo: &RgbImage, raster: &Rasterizer) -> Result<RgbImage> {
     let pixels = photo.data.len();
     let planes = raster.frame().planes.read_range(0..3 * pixels)?;
-    let left = raster.frame().transmittance.read_range(0..pixels)?;
-    let seen: Vec<usize> = (0..pixels).filter(|&p| left[p] < 0.5).collect();
-    let n = seen.len().max(1) as f64;
-    let moments = |value: &dyn Fn(usize) -> f32| {
-        let mean = seen.iter().map(|&p| f64::from(value(p))).sum::<f64>() / n;
-        let spread = seen.iter().map(|&p| (f64::from(value(p)) - mean).powi(2)).sum::<f64>() / n;
-        (mean, spread.sqrt())
-    };
+    let transmittance = raster.frame().transmittance.read_range(0..pixels)?;
+    let covered: Vec<usize> = (0..pixels).filter(|&p| transmittance[p] < 0.5).collect();
     let mut out = photo.clone();
     for c in 0..3 {
-        let (mean, spread) = moments(&|p| photo.data[p][c]);
-        let (own_mean, own_spread) = moments(&|p| planes[c * pixels + p]);
-        let gain = if spread > 1e-6 { own_spread / spread } else { 1.0 };
+        let (mean, deviation) = mean_and_deviation(&covered, |p| photo.data[p][c]);
+        let (scene_mean, scene_deviation) = mean_and_deviation(&covered, |p| planes[c * pixels + p]);
+        let gain = if deviation > 1e-6 { scene_deviation / deviation } else { 1.0 };
         for (p, value) in out.data.iter_mut().enumerate() {
-            let shown = planes[c * pixels + p];
-            let lit = (own_mean + gain * (f64::from(value[c]) - mean)) as f32;
-            value[c] = if left[p] < 0.5 { lit } else { shown };
+            let rendered = planes[c * pixels + p];
+            let corrected = (scene_mean + gain * (f64::from(value[c]) - mean)) as f32;
+            value[c] = if transmittance[p] < 0.5 { corrected } else { rendered };
         }
     }
     Ok(out)
+}
+
+fn mean_and_deviation(pixels: &[usize], value: impl Fn(usize) -> f32) -> (f64, f64) {
+    let n = pixels.len().max(1) as f64;
+    let mean = pixels.iter().map(|&p| f64::from(value(p))).sum::<f64>() / n;
+    let variance = pixels.iter().map(|&p| (f64::from(value(p)) - mean).powi(2)).sum::<f64>() / n;
+    (mean, variance.sqrt())
 }
 
 #[cfg(test)]
@@ -191,7 +191,7 @@ mod tests {
     use crate::scene::seeded;
     use glam::DVec3;
 
-    /// Splats with edges to hold on to, and what a camera sees of them.
+    /// Splats with sharp edges, and a render of them.
     fn scene() -> (Device, Splats, Camera, RgbImage) {
         let device = crate::gpu::open(None).unwrap();
         let (splats, camera) = seeded::small(400, 96, 72, 1, 5);
@@ -200,13 +200,13 @@ mod tests {
         (device, splats, camera, photo)
     }
 
-    fn apart(a: &Camera, b: &Camera) -> (f64, f64) {
+    fn displacement(a: &Camera, b: &Camera) -> (f64, f64) {
         let turn = a.pose.compose(&b.pose.inverse()).rotation;
         (rotation_angle(&turn).to_degrees(), (a.pose.centre() - b.pose.centre()).length())
     }
 
     #[test]
-    fn a_camera_finds_back_to_where_the_photo_was_taken_in_any_light() {
+    fn refine_recovers_pose_under_any_light() {
         let (device, splats, camera, mut photo) = scene();
         for c in &mut photo.data {
             *c = [0.7 * c[0] + 0.1, 0.8 * c[1], 0.9 * c[2] + 0.05];
@@ -215,17 +215,17 @@ mod tests {
         let off = Pose::exp(DVec3::new(0.006, -0.004, 0.005) * scale, DVec3::new(0.006, 0.008, -0.005));
         let given = Camera { pose: off.compose(&camera.pose), ..camera.clone() };
         let moved = ViewRefiner::new(&device, &splats).unwrap().refine(&given, &photo, &Silent).unwrap();
-        let (before, after) = (apart(&given, &camera), apart(&moved.camera, &camera));
+        let (before, after) = (displacement(&given, &camera), displacement(&moved.camera, &camera));
         assert!(before.0 > 0.6 && after.0 < 0.1, "{before:?} {after:?}");
         assert!(after.1 < 0.2 * before.1, "{before:?} {after:?}");
-        let told = apart(&moved.camera, &given);
-        assert!((told.0 - moved.rotation_degrees).abs() < 1e-9);
-        let seen_from_there = SceneScale::measure(std::slice::from_ref(&given), &splats.means).median_depth;
-        assert!((told.1 / seen_from_there - moved.centre_fraction).abs() < 1e-9);
+        let (rotation, distance) = displacement(&moved.camera, &given);
+        assert!((rotation - moved.rotation_degrees).abs() < 1e-9);
+        let median_depth = SceneScale::measure(std::slice::from_ref(&given), &splats.means).median_depth;
+        assert!((distance / median_depth - moved.centre_fraction).abs() < 1e-9);
     }
 
     #[test]
-    fn a_camera_that_is_right_stays() {
+    fn refine_keeps_exact_camera() {
         let (device, splats, camera, photo) = scene();
         let moved = ViewRefiner::new(&device, &splats).unwrap().refine(&camera, &photo, &Silent).unwrap();
         // 0.05 degrees are 0.08 pixels here; a smaller render is not quite the smaller photo.

@@ -1,4 +1,5 @@
-//! A scene scored against ground truth: rendered from every known camera, queried for every object.
+//! Evaluation of a scene against ground truth: rendered from every known camera, queried for every
+//! object.
 use super::refine::{RefinedCamera, ViewRefiner};
 use super::view::{DecodedFrame, Viewer};
 use crate::Result;
@@ -11,16 +12,16 @@ use crate::query::select::select;
 use crate::query::{QueryOptions, QueryResult, TextQuery, answer_with, field_relevancy};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 
-/// What is asked of a scene.
+/// Queries of an evaluation.
 pub struct Questions<'a> {
-    /// The evaluation's phrases in order; none for a scene without language.
+    /// Queries in the order of the evaluation's phrases; none for a scene without language.
     pub queries: &'a [TextQuery],
-    /// How answers are chosen.
+    /// Options of the answers.
     pub options: QueryOptions,
 }
 
-/// The figures of protocol `field`. With `refine`, held-out frames are scored a second time from
-/// refined cameras. `look` sees every decoded frame.
+/// Scores a scene under protocol `field`. With `refine`, held-out frames are scored a second time
+/// from refined cameras. Every decoded frame is passed to `visit`.
 pub fn score_field(
     device: &Device,
     splats: &Splats,
@@ -29,16 +30,16 @@ pub fn score_field(
     mut evaluation: Evaluation,
     refine: bool,
     progress: &dyn Progress,
-    look: &mut dyn FnMut(&TruthFrame, &DecodedFrame) -> Result<()>,
+    visit: &mut dyn FnMut(&TruthFrame, &DecodedFrame) -> Result<()>,
 ) -> Result<EvalReport> {
     let labels: Vec<u32> = evaluation.phrases().into_iter().map(|p| p.0).collect();
     let relevancy = queries.iter().map(|q| field_relevancy(field, q)).collect::<Result<Vec<_>>>()?;
     let places = Places::of(splats, field);
-    let things = |query: &TextQuery| -> Result<_> {
-        let chosen = select(field, &places, query, &options)?;
-        Ok(places.instances(&chosen.splats, chosen.level))
+    let instances = |query: &TextQuery| -> Result<_> {
+        let selection = select(field, &places, query, &options)?;
+        Ok(places.instances(&selection.splats, selection.level))
     };
-    evaluation.add_instances(&queries.iter().map(things).collect::<Result<Vec<_>>>()?)?;
+    evaluation.add_instances(&queries.iter().map(instances).collect::<Result<Vec<_>>>()?)?;
     let mut viewer = Viewer::new(device, splats, field)?;
     let refiner = if refine { Some(ViewRefiner::new(device, splats)?) } else { None };
     let frames = evaluation.cameras();
@@ -46,7 +47,7 @@ pub fn score_field(
     for (i, (frame, camera)) in frames.iter().enumerate() {
         progress.check()?;
         let view = viewer.view(camera)?;
-        look(frame, &view)?;
+        visit(frame, &view)?;
         let answer_all = |view: &DecodedFrame| -> Result<Vec<(u32, QueryResult)>> {
             let pairs = labels.iter().zip(&relevancy);
             pairs.map(|(label, r)| Ok((*label, answer_with(&view.codes, r, &options)?))).collect()
@@ -54,18 +55,19 @@ pub fn score_field(
         evaluation.add_frame(frame, &rendered(&view), &answer_all(&view)?)?;
         if let Some(refiner) = refiner.as_ref().filter(|_| frame.split == Split::Test) {
             let photo = evaluation.photo(frame)?;
-            let with_optics = evaluation.with_scene_optics(camera);
-            let (closer, moved) = refined(refiner, &mut viewer, (&with_optics, &view), &photo, progress)?;
+            let with_intrinsics = evaluation.with_scene_intrinsics(camera);
+            let (closer, moved) =
+                refine_view(refiner, &mut viewer, (&with_intrinsics, &view), &photo, progress)?;
             let score = RefinedView {
                 frame: frame.stem.clone(),
                 kept: closer.is_some(),
                 rotation_degrees: moved.rotation_degrees,
                 centre_fraction: moved.centre_fraction,
-                focal_relative: with_optics.fx / camera.fx - 1.0,
-                centre_shift: [with_optics.cx - camera.cx, with_optics.cy - camera.cy],
+                focal_relative: with_intrinsics.fx / camera.fx - 1.0,
+                centre_shift: [with_intrinsics.cx - camera.cx, with_intrinsics.cy - camera.cy],
             };
-            let shown = closer.as_ref().unwrap_or(&view);
-            evaluation.add_refined(frame, score, &rendered(shown), &answer_all(shown)?)?;
+            let best = closer.as_ref().unwrap_or(&view);
+            evaluation.add_refined(frame, score, &rendered(best), &answer_all(best)?)?;
         }
         progress.step(i as u64 + 1, "");
     }
@@ -78,9 +80,9 @@ fn rendered(view: &DecodedFrame) -> Rendered {
     Rendered { rgb: frame.rgb.clone(), alpha: frame.alpha.clone(), depth: frame.depth.clone() }
 }
 
-/// The frame from its refined camera, if that is closer to the photo, and how the camera moved.
-/// `camera` is the start, `given` what the true one shows.
-fn refined(
+/// Returns the frame from the refined camera if it is closer to the photo, and the displacement of
+/// the camera. `camera` is the start; `given` is the frame of the true camera.
+fn refine_view(
     refiner: &ViewRefiner,
     viewer: &mut Viewer,
     (camera, given): (&Camera, &DecodedFrame),
@@ -89,11 +91,11 @@ fn refined(
 ) -> Result<(Option<DecodedFrame>, RefinedCamera)> {
     let border = crate::photo::PlainBorder::of(photo);
     let inner = border.crop(photo);
-    let closeness =
+    let fitted_psnr =
         |view: &DecodedFrame| metrics::psnr(&colour_fit(&border.crop(&view.rendered.rgb), &inner), &inner);
     let moved = refiner.refine(camera, photo, progress)?;
     let view = viewer.view(&moved.camera)?;
-    Ok(((closeness(&view) > closeness(given)).then_some(view), moved))
+    Ok(((fitted_psnr(&view) > fitted_psnr(given)).then_some(view), moved))
 }
 
 #[cfg(test)]
@@ -109,7 +111,7 @@ mod tests {
     use serde_json::json;
 
     #[test]
-    fn a_truth_of_another_focal_length_is_met_with_the_scene_s_own() {
+    fn refined_views_use_scene_focal_length() {
         let device = crate::gpu::open(None).unwrap();
         let (splats, camera) = seeded::small(400, 96, 72, 1, 5);
         let mut renderer = Renderer::new(&device, &splats, &[], 0).unwrap();
@@ -123,8 +125,7 @@ mod tests {
             let (r, t) = (pose.rotation.transpose(), pose.translation);
             let row = |axis: DVec3, shift: f64| [axis.x, axis.y, axis.z, shift];
             let matrix = [row(r.x_axis, t.x), row(r.y_axis, t.y), row(r.z_axis, t.z), [0.0, 0.0, 0.0, 1.0]];
-            // What it states is an eighth more than the focal length that the photos were taken
-            // with.
+            // The stated focal length is an eighth longer than that of the photos.
             frames.push(json!({
                 "file": own.name, "split": if k < 2 { "train" } else { "test" }, "fx": 1.125 * own.fx,
                 "fy": 1.125 * own.fy, "cx": own.cx, "cy": own.cy, "world_to_camera": matrix,
@@ -135,9 +136,9 @@ mod tests {
         std::fs::write(folder.path().join("ground_truth.json"), text).unwrap();
         let evaluation = Evaluation::new(GroundTruth::read(folder.path()).unwrap(), &scene, None).unwrap();
         let field = LanguageField::default();
-        let nothing = Questions { queries: &[], options: QueryOptions::default() };
+        let no_queries = Questions { queries: &[], options: QueryOptions::default() };
         let report =
-            score_field(&device, &splats, &field, nothing, evaluation, true, &Silent, &mut |_, _| Ok(()))
+            score_field(&device, &splats, &field, no_queries, evaluation, true, &Silent, &mut |_, _| Ok(()))
                 .unwrap();
         let given = report.images.iter().find(|i| i.split == Split::Test).unwrap().psnr_colour_fit;
         let refined = report.refined.unwrap();
@@ -149,17 +150,17 @@ mod tests {
     }
 
     #[test]
-    fn a_refined_camera_that_shows_the_photo_worse_than_the_given_one_is_not_taken() {
+    fn worse_refined_camera_is_dropped() {
         let device = crate::gpu::open(None).unwrap();
         let (splats, camera) = seeded::small(400, 96, 72, 1, 5);
         let mut viewer = Viewer::new(&device, &splats, &LanguageField::default()).unwrap();
         let refiner = ViewRefiner::new(&device, &splats).unwrap();
         let given = viewer.view(&camera).unwrap();
         let photo = given.rendered.rgb.clone();
-        // 9 degrees off; all steps together turn a camera by 2 about each axis.
+        // 9 degrees off; all steps together rotate a camera by 2 about each axis.
         let turn = Pose::exp(DVec3::ZERO, DVec3::new(0.0, 0.15, 0.0));
         let start = Camera { pose: turn.compose(&camera.pose), ..camera.clone() };
-        let (closer, moved) = refined(&refiner, &mut viewer, (&start, &given), &photo, &Silent).unwrap();
+        let (closer, moved) = refine_view(&refiner, &mut viewer, (&start, &given), &photo, &Silent).unwrap();
         assert!(closer.is_none(), "{moved:?}");
     }
 }

@@ -11,20 +11,21 @@ use crate::report::{self, AnswerShown, HtmlReport, QueryShown, ViewShown};
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, Seen, Splats, World};
 use std::path::Path;
 
-/// A line per photo that joined a scene.
+/// A line for every photo that joined a scene.
 fn added_figures(o: &RunOutcome) -> Vec<(String, String)> {
     if o.known == 0 {
         return Vec::new();
     }
-    let one = |v: usize| {
-        let confidence = confidence(&o.geometry.fitted[v], &o.psnr).name();
-        let psnr = o.psnr.get(v).copied().unwrap_or(0.0);
-        ("added".to_owned(), format!("{}: {confidence} confidence, {psnr:.2} dB", o.photos[v].stem))
-    };
-    (o.known..o.photos.len()).map(one).collect()
+    (o.known..o.photos.len()).map(|view| added_figure(o, view)).collect()
 }
 
-/// The focal length of every camera that the photos were taken with, as far as it was measured.
+fn added_figure(o: &RunOutcome, view: usize) -> (String, String) {
+    let confidence = confidence(&o.geometry.fitted[view], &o.psnr).name();
+    let psnr = o.psnr.get(view).copied().unwrap_or(0.0);
+    ("added".to_owned(), format!("{}: {confidence} confidence, {psnr:.2} dB", o.photos[view].stem))
+}
+
+/// Measured focal length of every camera id.
 fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Option<String> {
     let mut groups: Vec<(usize, String, Vec<&str>)> = Vec::new();
     for ((photo, camera), fitted) in photos.iter().zip(cameras).zip(fitted) {
@@ -46,50 +47,51 @@ fn focal_figure(photos: &[Photo], cameras: &[Camera], fitted: &[Fitted]) -> Opti
     }
 }
 
-/// Trust in the camera of a photo: what the cameras say of themselves, and no more than how well
-/// the scene shows the photos.
+/// Confidence in the camera of a photo, limited by how well the scene shows the photos.
 pub(super) fn confidence(fitted: &Fitted, psnr: &[f64]) -> Confidence {
     fitted.confidence().min(super::fidelity::ceiling(psnr))
 }
 
-/// How far the cameras are to be trusted: that of the worst, and which are worse than the best.
+/// Lowest confidence over the cameras, with the photos below the highest.
 fn confidence_figure(photos: &[Photo], fitted: &[Fitted], psnr: &[f64]) -> Option<String> {
     let levels: Vec<Confidence> = fitted.iter().map(|f| confidence(f, psnr)).collect();
     let (worst, best) = (levels.iter().min()?, levels.iter().max()?);
-    let named = photos.iter().zip(&levels).filter(|(_, l)| *l < best).map(|(p, _)| p.stem.as_str());
-    let named: Vec<&str> = named.collect();
-    let which = if named.is_empty() { String::new() } else { format!(" ({})", named.join(", ")) };
-    Some(format!("{} confidence{which}", worst.name()))
+    let doubtful = photos.iter().zip(&levels).filter(|(_, l)| *l < best).map(|(p, _)| p.stem.as_str());
+    let doubtful: Vec<&str> = doubtful.collect();
+    let suffix = if doubtful.is_empty() { String::new() } else { format!(" ({})", doubtful.join(", ")) };
+    Some(format!("{} confidence{suffix}", worst.name()))
 }
 
-/// What was assumed about the lens: the strongest distortion taken out, and how far the principal
-/// point is from the middle.
+/// Estimated lens: the strongest distortion taken out, and the offset of the principal point from
+/// the centre.
 fn lens_figure(o: &RunOutcome) -> Option<String> {
-    let corner = |(photo, camera): (&Photo, &Camera)| {
-        let half = glam::DVec2::new(0.5 * camera.width as f64, 0.5 * camera.height as f64) / camera.fx;
-        (photo.lens().distort(half).length() / half.length() - 1.0, photo.lens())
-    };
-    let all = o.photos.iter().zip(&o.cameras).map(corner);
+    let all = o.photos.iter().zip(&o.cameras).map(|(p, c)| (corner_distortion(p, c), p.lens()));
     let (share, lens) = all.max_by(|a, b| a.0.abs().total_cmp(&b.0.abs()))?;
     let camera = o.cameras.first()?;
-    let shift = [camera.cx / camera.width as f64 - 0.5, camera.cy / camera.height as f64 - 0.5];
-    let bend = match lens.is_none() {
+    let offset = [camera.cx / camera.width as f64 - 0.5, camera.cy / camera.height as f64 - 0.5];
+    let distortion = match lens.is_none() {
         true => "no distortion seen".to_owned(),
         false => {
             format!("k1 {:.3}, k2 {:.3} ({:+.1} % at the corner), taken out", lens.k1, lens.k2, 100.0 * share)
         }
     };
-    let centre = match shift.iter().all(|s| s.abs() < 1e-9) {
+    let centre = match offset.iter().all(|s| s.abs() < 1e-9) {
         true => String::new(),
-        false => format!("; centre off by {:+.1}, {:+.1} %", 100.0 * shift[0], 100.0 * shift[1]),
+        false => format!("; centre off by {:+.1}, {:+.1} %", 100.0 * offset[0], 100.0 * offset[1]),
     };
-    (!o.geometry.fitted.is_empty()).then(|| bend + &centre)
+    (!o.geometry.fitted.is_empty()).then(|| distortion + &centre)
+}
+
+/// Relative displacement of the image corner by the lens.
+fn corner_distortion(photo: &Photo, camera: &Camera) -> f64 {
+    let corner = glam::DVec2::new(0.5 * camera.width as f64, 0.5 * camera.height as f64) / camera.fx;
+    photo.lens().distort(corner).length() / corner.length() - 1.0
 }
 
 /// Figures for the head of the report and the closing table: (label, value).
 fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
-    // Which, and why, is said when they are chosen, and in run.json.
+    // The progress output and run.json list the choice with reasons.
     let mut chosen = o.choice.as_ref().map_or(String::new(), |c| {
         format!("; {} chosen of {}", c.used.len(), c.used.len() + c.left_out.len())
     });
@@ -123,16 +125,16 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
     list
 }
 
-/// How many splats there are, and how many of them are guessed.
+/// Number of splats, and how many of them are extrapolated.
 fn splats_figure(splats: &Splats, seen: &Seen) -> (String, String) {
-    let guessed = match seen.unseen() {
+    let unseen = match seen.unseen() {
         0 => String::new(),
         n => format!(", {n} of them where no photo looks"),
     };
-    ("splats".to_owned(), format!("{}{guessed}", splats.len()))
+    ("splats".to_owned(), format!("{}{unseen}", splats.len()))
 }
 
-/// The SH degree of the colours, if it is not 0, and what photos say of it.
+/// SH degree of the colours unless it is 0, with the gain on photos left out.
 fn view_dependence_figure(found: &ViewDependence) -> Option<(String, String)> {
     let text = match (found.degree, found.trials.last()) {
         (0, _) => return None,
@@ -144,7 +146,7 @@ fn view_dependence_figure(found: &ViewDependence) -> Option<(String, String)> {
     Some(("colours".to_owned(), text))
 }
 
-/// Which way is up, and what says so.
+/// Uncertainty of the direction up, with its evidence.
 fn up_figure(world: &World) -> (String, String) {
     let text = match &world.up {
         Some(up) => {
@@ -156,37 +158,33 @@ fn up_figure(world: &World) -> (String, String) {
     ("up".to_owned(), text)
 }
 
-/// How many photos were used, at which size, and how to change that where they were scaled down.
+/// Number and sizes of the photos, with a hint if they were scaled down.
 fn sizes(photos: &[Photo]) -> String {
-    #[derive(PartialEq)]
-    struct Sizes {
-        working: (usize, usize),
-        original: (usize, usize),
-    }
-    let mut pairs: Vec<Sizes> = Vec::new();
-    for p in photos {
-        let original = (p.original_size.0 as usize, p.original_size.1 as usize);
-        let pair = Sizes { working: (p.image.width, p.image.height), original };
-        if !pairs.contains(&pair) {
-            pairs.push(pair);
+    let mut distinct: Vec<String> = Vec::new();
+    for photo in photos {
+        let text = size_text(photo);
+        if !distinct.contains(&text) {
+            distinct.push(text);
         }
     }
-    let scaled = |s: &Sizes| s.working != s.original;
-    let one = |s: &Sizes| {
-        let ((w, h), (original_w, original_h)) = (s.working, s.original);
-        match scaled(s) {
-            true => format!("{w} × {h} of {original_w} × {original_h}"),
-            false => format!("{w} × {h}"),
-        }
-    };
-    // More than a few sizes would not fit a line; run.json has them all.
-    let shown: Vec<String> = pairs.iter().take(3).map(one).collect();
-    let more = if pairs.len() > 3 { ", …" } else { "" };
+    // A line fits only a few sizes; run.json has them all.
+    let more = if distinct.len() > 3 { ", …" } else { "" };
+    distinct.truncate(3);
     let hint = if photos.iter().any(|p| p.zoom() < 1.0) { " (--max-size changes it)" } else { "" };
-    format!("{} at {}{more}{hint}", photos.len(), shown.join(", "))
+    format!("{} at {}{more}{hint}", photos.len(), distinct.join(", "))
 }
 
-/// The table that ends `splatvk run`; where the scene is of doubtful quality that stands first.
+/// Working size of a photo, with the original size if it was scaled.
+fn size_text(photo: &Photo) -> String {
+    let (w, h) = (photo.image.width, photo.image.height);
+    let original = (photo.original_size.0 as usize, photo.original_size.1 as usize);
+    match original == (w, h) {
+        true => format!("{w} × {h}"),
+        false => format!("{w} × {h} of {} × {}", original.0, original.1),
+    }
+}
+
+/// The table that ends `splatvk run`; a warning of doubtful quality precedes it.
 pub fn closing_table(o: &RunOutcome) -> String {
     super::fidelity::heading(&o.psnr) + &report::table(&o.stages, o.seconds, &figures(o))
 }
@@ -197,7 +195,7 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
     record.write(folder)?;
     let levels: Vec<Vec<_>> =
         o.frames.iter().map(|f| LEVEL_NAMES.into_iter().zip(f.codes.iter().cloned()).collect()).collect();
-    // What renders are compared with.
+    // Renders are compared with these.
     let targets: Vec<RgbImage> = o.photos.iter().map(Photo::target).collect();
     let views = o
         .photos
@@ -228,7 +226,7 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
     report::write_previews(folder, &report)
 }
 
-/// Names of codes where there are none.
+/// Names of codes for scenes without language.
 static NO_NAMES: CodeNames = Vec::new();
 
 fn scene<'a>(title: &'a str, photos: &'a [RgbImage], o: &'a RunOutcome) -> Scene3d<'a> {
@@ -269,7 +267,7 @@ mod tests {
     use crate::scene::seeded;
 
     #[test]
-    fn the_focal_length_is_told_per_camera() {
+    fn focal_figure_groups_by_camera() {
         let image = RgbImage { width: 64, height: 64, data: vec![[0.5; 3]; 64 * 64] };
         let photo = |name: &str| crate::photo::from_pixels(name.as_ref(), &image, None, 64).unwrap();
         let photos = ["a.png", "b.png", "c.png", "d.png"].map(photo);

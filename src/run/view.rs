@@ -1,4 +1,4 @@
-//! A scene with language seen from cameras: rendered and decoded.
+//! Views of a scene with language: rendered and decoded.
 use super::border::Border;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder};
@@ -22,14 +22,14 @@ pub struct DecodedFrame {
     pub codes: Vec<Image<i32>>,
 }
 
-/// Renders and decodes one camera after the other, both on the device.
+/// Renders and decodes cameras one by one, both on the device.
 pub struct Viewer {
     device: Device,
-    /// First the scene's own splats, then those of the levels that have others.
+    /// The scene's own splats first, then those of levels with splats of their own.
     models: Vec<Model>,
-    /// Of the field.
+    /// Number of levels of the field.
     levels: usize,
-    /// Decoded codes, of the size of the last view.
+    /// Decoded codes at the size of the last view.
     output: Option<Buffer<i32>>,
 }
 
@@ -39,32 +39,40 @@ struct Model {
     levels: Vec<CarriedLevel>,
 }
 
-/// A level's codes, and where its features are among the channels of its model and of all models.
+/// Codes of a level, with its feature channels in its model (`channels`) and in the frame of all
+/// models (`shown`).
 struct CarriedLevel {
     level: usize,
     codes: Codes,
-    /// Of short codes, which of them a pixel may have.
+    /// Restriction of short codes to those in the pixel.
     border: Option<Border>,
     channels: Range<usize>,
     shown: Range<usize>,
 }
 
-/// Where the features of a level are rendered.
+impl CarriedLevel {
+    /// Number of features per pixel that the border rule reads.
+    fn border_channels(&self) -> usize {
+        if self.border.is_some() { self.channels.len() } else { 0 }
+    }
+}
+
+/// Place of a level's features in the output of [`Viewer::draw_bands`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct FeatureChannels {
-    /// For [`Viewer::draw_bands`].
+    /// Model for [`Viewer::draw_bands`].
     pub model: usize,
-    /// First of its feature channels.
+    /// First feature channel of the level.
     pub first: usize,
-    /// How many.
+    /// Number of channels.
     pub count: usize,
 }
 
-/// The model of [`Viewer::draw_bands`] that shows the scene: its colours, its depth.
+/// Model of [`Viewer::draw_bands`] with the scene's colours and depth.
 pub const SCENE_MODEL: usize = 0;
 
 impl Model {
-    /// Uploads splats with the features of some levels side by side; `shown` has the channels of
+    /// Uploads splats with the features of some levels side by side; `shown` holds the channels of
     /// every level.
     fn new(
         device: &Device,
@@ -113,17 +121,17 @@ impl Viewer {
         Ok(Viewer { device: device.clone(), models, levels: shown.len(), output: None })
     }
 
-    /// The scene from one camera.
+    /// Renders and decodes the scene from one camera.
     pub fn view(&mut self, camera: &Camera) -> Result<DecodedFrame> {
-        self.seen(camera, false)
+        self.render_and_decode(camera, false)
     }
 
-    /// The scene from one camera, with the blended features: about ten times the data.
+    /// Like [`Viewer::view`], with the blended features: about ten times the data.
     pub fn view_with_features(&mut self, camera: &Camera) -> Result<DecodedFrame> {
-        self.seen(camera, true)
+        self.render_and_decode(camera, true)
     }
 
-    /// Where [`Viewer::draw_bands`] renders the features of a level; `None` where it has none.
+    /// Place of a level's features in [`Viewer::draw_bands`]; `None` for a level without features.
     pub fn features(&self, level: usize) -> Option<FeatureChannels> {
         self.models.iter().enumerate().find_map(|(model, m)| {
             let channels = &m.levels.iter().find(|l| l.level == level)?.channels;
@@ -131,38 +139,43 @@ impl Viewer {
         })
     }
 
-    /// Renders one camera that the device holds at once, as the scene's own splats show it. The
-    /// frame stays on the device, and valid until the next call.
+    /// Renders the scene's own splats from one camera whose frame fits on the device. The frame
+    /// stays on the device and is valid until the next call.
     pub fn draw(&mut self, camera: &Camera) -> Result<&FrameBuffers> {
         Ok(self.models[SCENE_MODEL].renderer.draw(camera)?.frame())
     }
 
-    /// Renders one camera band by band and shows every band while it is on the device. `model` is
-    /// [`SCENE_MODEL`] or that of [`Viewer::features`].
+    /// Renders one camera band by band and passes each band to `visit` while it is on the device.
+    /// `model` is [`SCENE_MODEL`] or that of [`Viewer::features`].
     pub fn draw_bands(
         &mut self,
         model: usize,
         camera: &Camera,
-        seen: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
+        visit: impl FnMut(&FrameBuffers, &Band) -> Result<()>,
     ) -> Result<()> {
-        self.models[model].renderer.draw_bands(camera, seen)
+        self.models[model].renderer.draw_bands(camera, visit)
     }
 
-    /// Only the codes of one camera, as [`DecodedFrame::codes`].
+    /// Codes of one camera, as [`DecodedFrame::codes`].
     pub fn codes(&mut self, camera: &Camera) -> Result<Vec<Image<i32>>> {
-        self.decoded(camera, None)
+        self.decode_view(camera, None)
     }
 
-    fn seen(&mut self, camera: &Camera, features: bool) -> Result<DecodedFrame> {
+    fn render_and_decode(&mut self, camera: &Camera, features: bool) -> Result<DecodedFrame> {
         let width: usize = self.models.iter().map(|m| m.renderer.feature_dim()).sum();
         let (w, h) = (camera.width as usize, camera.height as usize);
         let mut rendered = RenderedFrame::empty(w, h, if features { width } else { 0 });
-        let codes = self.decoded(camera, Some(&mut rendered))?;
+        let codes = self.decode_view(camera, Some(&mut rendered))?;
         Ok(DecodedFrame { rendered, codes })
     }
 
-    /// Renders every model that `shown` or the codes need, and reads what `shown` has room for.
-    fn decoded(&mut self, camera: &Camera, mut shown: Option<&mut RenderedFrame>) -> Result<Vec<Image<i32>>> {
+    /// Renders the models that `shown` or the codes need, and reads the parts that `shown` has room
+    /// for.
+    fn decode_view(
+        &mut self,
+        camera: &Camera,
+        mut shown: Option<&mut RenderedFrame>,
+    ) -> Result<Vec<Image<i32>>> {
         let (w, h) = (camera.width as usize, camera.height as usize);
         let mut codes = vec![Image::filled(w, h, -1); self.levels];
         let (device, output) = (&self.device, &mut self.output);
@@ -170,8 +183,8 @@ impl Viewer {
             if levels.is_empty() && !(m == SCENE_MODEL && shown.is_some()) {
                 continue;
             }
-            let short = |l: &CarriedLevel| if l.border.is_some() { l.channels.len() } else { 0 };
-            let mut kept: Vec<_> = levels.iter().map(|l| RenderedFrame::empty(w, h, short(l))).collect();
+            let mut kept: Vec<_> =
+                levels.iter().map(|l| RenderedFrame::empty(w, h, l.border_channels())).collect();
             renderer.draw_bands(camera, |frame, band| {
                 decode(device, levels, output, frame, band, &mut codes)?;
                 if let Some(shown) = shown.as_deref_mut() {
@@ -190,7 +203,7 @@ impl Viewer {
             })?;
             for (level, kept) in levels.iter_mut().zip(kept) {
                 if let Some(border) = &mut level.border {
-                    border.settle(camera, &kept.features, &mut codes[level.level])?;
+                    border.decode_again(camera, &kept.features, &mut codes[level.level])?;
                 }
             }
         }
@@ -198,7 +211,7 @@ impl Viewer {
     }
 }
 
-/// Decodes the levels of a band into `codes`; `output` keeps the buffers for the next one of the
+/// Decodes the levels of a band into `codes`; `output` keeps the buffer for the next band of the
 /// same size.
 fn decode(
     device: &Device,
@@ -215,9 +228,9 @@ fn decode(
     };
     for level in levels {
         let mut rec = Recorder::new(device, "decode");
-        let at = (BASE_CHANNELS + level.channels.start) as u32;
+        let first_plane = (BASE_CHANNELS + level.channels.start) as u32;
         let (planes, transmittance) = (&frame.planes, &frame.transmittance);
-        level.codes.record(&mut rec, planes, at, transmittance, pixels, &decoded);
+        level.codes.record(&mut rec, planes, first_plane, transmittance, pixels, &decoded);
         rec.run()?;
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
         codes[level.level].data[inner].copy_from_slice(&decoded.read_range(stored)?);
@@ -226,7 +239,7 @@ fn decode(
     Ok(())
 }
 
-/// How much of the photos, taken by these cameras, every splat shows.
+/// Blending weight of every splat, summed over the pixels of these cameras.
 pub fn seen(device: &Device, splats: &Splats, cameras: &[Camera], progress: &dyn Progress) -> Result<Seen> {
     progress.begin("seen", cameras.len() as u64);
     let mut renderer = Renderer::new(device, splats, &[], 0)?;
@@ -240,12 +253,11 @@ pub fn seen(device: &Device, splats: &Splats, cameras: &[Camera], progress: &dyn
     Ok(Seen { pixels })
 }
 
-/// Share of every pixel that splats blend into it which no photo shows; alpha, without them, is
-/// what is known of it.
+/// Renders the blended share of unseen splats per pixel; alpha minus this share is shown by photos.
 pub struct UnseenShare(Renderer);
 
 impl UnseenShare {
-    /// Uploads the scene in two colours.
+    /// Uploads the scene with colour 1 for unseen splats and 0 for the others.
     pub fn new(device: &Device, splats: &Splats, seen: &Seen) -> Result<UnseenShare> {
         let dc = |i: usize| (f32::from(u8::from(seen.is_unseen(i))) - 0.5) / SH_C0;
         let sh = (0..splats.len()).flat_map(|i| [dc(i); 3]).collect();
@@ -260,7 +272,7 @@ impl UnseenShare {
     }
 }
 
-/// The scene from every camera.
+/// Renders and decodes the scene from every camera.
 pub fn decode_all(
     device: &Device,
     splats: &Splats,

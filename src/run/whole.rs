@@ -1,7 +1,7 @@
-//! Whole numbers of a range as values of options.
+//! Parser of whole numbers for options.
 use std::ops::{Bound, RangeBounds};
 
-/// Parses a whole number of a range.
+/// Parses a whole number in a range.
 pub fn whole<T: TryFrom<u64>>(
     range: impl RangeBounds<u64> + Clone + Send + Sync + 'static,
 ) -> impl Fn(&str) -> Result<T, String> + Clone + Send + Sync + 'static {

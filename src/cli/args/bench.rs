@@ -1,4 +1,4 @@
-//! `splatvk bench`: what to measure, and on what.
+//! `splatvk bench`: parts to measure, and their data.
 use super::whole;
 use crate::Result;
 use crate::infer::{Compute, Registry};
@@ -6,7 +6,7 @@ use crate::photo::SMALLEST_SIDE;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 
-/// What `bench` measures beside the roofline.
+/// Parts that `bench` measures beside the roofline.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum BenchPart {
     /// Every pass of a training step and the whole, on colour and with features
@@ -110,7 +110,7 @@ pub struct BenchArgs {
 }
 
 impl BenchArgs {
-    /// The models.
+    /// Installed models.
     pub fn registry(&self) -> Result<Registry> {
         Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref()))
     }

@@ -6,7 +6,7 @@ use crate::run::{CHECKPOINT_SECONDS, Destination, Machine};
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 
-/// What goes to standard error.
+/// Format of standard error.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum LogFormat {
     /// Bars on a terminal, a line per stage elsewhere
@@ -38,7 +38,7 @@ pub struct SavingArgs {
 }
 
 impl SavingArgs {
-    /// The scene directory, and what earlier runs left for it.
+    /// Scene directory, with the use of earlier runs.
     pub fn destination(&self, out: PathBuf) -> Destination {
         let SavingArgs { resume, force, checkpoint_seconds, .. } = *self;
         Destination { out, force, resume, checkpoint_seconds }
@@ -69,7 +69,7 @@ impl DeviceArgs {
         Machine { device, models, provider }
     }
 
-    /// The models.
+    /// Installed models.
     pub fn registry(&self) -> Result<Registry> {
         self.machine().registry()
     }

@@ -1,11 +1,11 @@
-//! The labels of the published layouts as one object index per pixel, as ground truth for masks and
+//! Labels of the published layouts as one object index per pixel: ground truth for masks and
 //! features.
 use crate::eval::ObjectMaps;
 use crate::scene::{Camera, Image};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-/// What a folder of a published layout labels.
+/// Labels of a folder in a published layout.
 #[derive(Clone, Debug)]
 pub struct Labels {
     /// Labelled frames in order, by file stem.
@@ -14,24 +14,24 @@ pub struct Labels {
     pub phrases: BTreeMap<u32, String>,
     /// Object index per pixel of each frame.
     pub maps: Arc<dyn ObjectMaps>,
-    /// Cameras that the layout itself states.
+    /// Cameras of the layout itself.
     pub cameras: Vec<Camera>,
 }
 
-/// Numbered from 1 in their order.
+/// Numbers phrases from 1 in their order.
 pub(super) fn numbered(phrases: impl IntoIterator<Item = String>) -> BTreeMap<u32, String> {
     (1..).zip(phrases).collect()
 }
 
-/// Masks of one frame as one plane: where objects overlap, the smaller one is seen in front of the
-/// larger.
-pub(super) fn painted(mut masks: Vec<(u32, Image<bool>)>) -> Option<Image<u32>> {
-    masks.sort_by_key(|(_, m)| std::cmp::Reverse(m.data.iter().filter(|&&in_it| in_it).count()));
+/// Paints the masks of one frame into one image of object indices: of overlapping objects the
+/// smaller one is in front.
+pub(super) fn paint(mut masks: Vec<(u32, Image<bool>)>) -> Option<Image<u32>> {
+    masks.sort_by_key(|(_, m)| std::cmp::Reverse(m.data.iter().filter(|&&inside| inside).count()));
     let (_, first) = masks.first()?;
     let mut out = Image::filled(first.width, first.height, 0u32);
     let pixels = out.data.len();
     for (label, mask) in masks.iter().filter(|(_, m)| m.data.len() == pixels) {
-        let inside = out.data.iter_mut().zip(&mask.data).filter(|(_, in_it)| **in_it);
+        let inside = out.data.iter_mut().zip(&mask.data).filter(|(_, inside)| **inside);
         inside.for_each(|(slot, _)| *slot = *label);
     }
     Some(out)
@@ -42,14 +42,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn of_overlapping_masks_the_smaller_one_is_in_front() {
+    fn paint_puts_smaller_masks_in_front() {
         let mask = |from: usize, to: usize| Image {
             width: 6,
             height: 1,
             data: (0..6).map(|x| (from..to).contains(&x)).collect(),
         };
-        let plane = painted(vec![(7, mask(2, 4)), (3, mask(0, 5))]).unwrap();
+        let plane = paint(vec![(7, mask(2, 4)), (3, mask(0, 5))]).unwrap();
         assert_eq!(plane.data, [3, 3, 7, 7, 3, 0]);
-        assert!(painted(Vec::new()).is_none());
+        assert!(paint(Vec::new()).is_none());
     }
 }

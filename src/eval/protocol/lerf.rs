@@ -1,10 +1,10 @@
 //! LERF-OVS as LangSplat evaluates it (docs/internals/method.md#lerf-ovs): polygons and boxes per
 //! labelled frame.
-use super::labels::{Labels, numbered, painted};
+use super::labels::{Labels, numbered, paint};
 use super::polygon;
 use super::score::{
-    DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,
-    mean, place, summarise,
+    DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score,
+    labelled_views, mask_iou, mean, summarise,
 };
 use crate::eval::{MIN_OBJECT_PIXELS, ObjectMaps};
 use crate::query::filter;
@@ -18,19 +18,19 @@ use std::sync::Arc;
 /// Thresholds on the re-normalised map, the first one behind `miou`: the paper's, LangSplat's.
 const THRESHOLDS: [(f32, &str, &str); 2] = [(0.6, "thr0.6", "miou"), (0.4, "thr0.4", "miou_thr0.4")];
 
-/// What one prompt means in one frame.
+/// Truth of one prompt in one frame.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Target {
-    /// [H, W] of the label's size.
+    /// [H, W] at the label's size.
     pub mask: Image<bool>,
-    /// x1, y1, x2, y2 in label pixels, both ends inside.
+    /// x1, y1, x2, y2 in label pixels, both ends inclusive.
     pub boxes: Vec<[f64; 4]>,
 }
 
-/// The labels and what was scored so far.
+/// Labels, and the scores so far.
 pub(super) struct Lerf {
     views: Vec<LabelledView>,
-    /// Per view.
+    /// Truth of each view by prompt.
     targets: Vec<BTreeMap<String, Target>>,
     prompts: Vec<String>,
     scores: Vec<Score>,
@@ -57,22 +57,23 @@ struct Object {
     bbox: Vec<f64>,
 }
 
-/// Objects of one category are one target: their masks joined, their boxes side by side.
+/// Parses a label file. Objects of one category are one target: the union of their masks, and all
+/// their boxes.
 pub(super) fn parse(text: &str, path: &Path) -> Result<BTreeMap<String, Target>> {
     let file: File = files::parse_json(text.as_bytes())
         .map_err(|e| Error::input(format!("{}: not a LERF-OVS label file: {e}", path.display())))?;
     let (width, height) = (file.info.width, file.info.height);
-    let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
+    let invalid = |problem: String| Error::input(format!("{}: {problem}", path.display()));
     let mut names: Vec<&str> = file.objects.iter().map(|o| o.category.as_str()).collect();
     names.sort_unstable();
     names.dedup();
     let numbers = file.objects.iter().flat_map(|o| o.segmentation.as_flattened().iter().chain(&o.bbox));
-    // NaN is in no range.
+    // NaN compares false.
     if !numbers.into_iter().all(|v| v.abs() <= polygon::FARTHEST) {
-        return Err(bad(format!("a corner is beyond {} pixels; check its objects", polygon::FARTHEST)));
+        return Err(invalid(format!("a corner is beyond {} pixels; check its objects", polygon::FARTHEST)));
     }
     if names.len().saturating_mul(width).saturating_mul(height) as u64 > MAX_PIXELS {
-        return Err(bad(format!(
+        return Err(invalid(format!(
             "{} objects of {width} × {height} pixels are too many; check its \"info\"",
             names.len()
         )));
@@ -96,7 +97,7 @@ impl Lerf {
             None => {
                 let mut labels = read_folder(folder)?;
                 let stems: Vec<String> = labels.keys().cloned().collect();
-                let views = place(&stems, scene, known)?;
+                let views = labelled_views(&stems, scene, known)?;
                 let targets = views.iter().map(|v| labels.remove(&v.stem).unwrap_or_default()).collect();
                 (views, targets)
             }
@@ -128,17 +129,17 @@ fn read_folder(folder: &Path) -> Result<BTreeMap<String, BTreeMap<String, Target
     Ok(labels)
 }
 
-/// Planes that are all in memory: a LERF scene has a handful of labelled frames.
+/// Label images in memory: a LERF scene has a handful of labelled frames.
 #[derive(Debug)]
-struct Painted(BTreeMap<String, Image<u32>>);
+struct LabelImages(BTreeMap<String, Image<u32>>);
 
-impl ObjectMaps for Painted {
+impl ObjectMaps for LabelImages {
     fn objects(&self, stem: &str) -> Result<Option<Image<u32>>> {
         Ok(self.0.get(stem).cloned())
     }
 }
 
-/// The labels as one plane per frame.
+/// Reads the labels as one image of object indices per frame.
 pub(super) fn labels(folder: &Path) -> Result<Labels> {
     let frames = read_folder(folder)?;
     let mut names: Vec<String> = frames.values().flat_map(|f| f.keys().cloned()).collect();
@@ -147,17 +148,18 @@ pub(super) fn labels(folder: &Path) -> Result<Labels> {
     let phrases = numbered(names);
     let stems: Vec<String> = frames.keys().cloned().collect();
     let number = |name: &String| phrases.iter().find(|p| p.1 == name).map_or(0, |p| *p.0);
-    let plane = |targets: BTreeMap<String, Target>| {
-        painted(targets.into_iter().map(|(name, target)| (number(&name), target.mask)).collect())
+    let label_image = |targets: BTreeMap<String, Target>| {
+        paint(targets.into_iter().map(|(name, target)| (number(&name), target.mask)).collect())
     };
-    let planes = frames.into_iter().filter_map(|(stem, targets)| Some((stem, plane(targets)?))).collect();
+    let images =
+        frames.into_iter().filter_map(|(stem, targets)| Some((stem, label_image(targets)?))).collect();
     if phrases.is_empty() {
         return Err(Error::input(format!("{}: no object in any label file", folder.display())));
     }
-    Ok(Labels { stems, phrases, maps: Arc::new(Painted(planes)), cameras: Vec::new() })
+    Ok(Labels { stems, phrases, maps: Arc::new(LabelImages(images)), cameras: Vec::new() })
 }
 
-/// The masks of a ground-truth folder, each object with the box around it.
+/// Truth from the masks of a ground-truth folder, each object with its bounding box.
 fn from_masks(own: OwnLabels) -> Result<(Vec<LabelledView>, Vec<BTreeMap<String, Target>>)> {
     let mut all = Vec::new();
     for view in &own.views {
@@ -179,8 +181,8 @@ fn target_of(objects: &Image<u32>, label: u32) -> Target {
     let data: Vec<bool> = objects.data.iter().map(|&o| o == label).collect();
     let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
     for (p, _) in data.iter().enumerate().filter(|(_, m)| **m) {
-        let at = [(p % objects.width) as f64, (p / objects.width) as f64];
-        (0..2).for_each(|k| (low[k], high[k]) = (low[k].min(at[k]), high[k].max(at[k])));
+        let pixel = [(p % objects.width) as f64, (p / objects.width) as f64];
+        (0..2).for_each(|k| (low[k], high[k]) = (low[k].min(pixel[k]), high[k].max(pixel[k])));
     }
     let boxes = if low[0] <= high[0] { vec![[low[0], low[1], high[0], high[1]]] } else { Vec::new() };
     Target { mask: Image { width: objects.width, height: objects.height, data }, boxes }
@@ -195,12 +197,12 @@ impl Protocol for Lerf {
         self.prompts.clone()
     }
 
-    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks> {
+    fn add(&mut self, index: usize, decoded: &DecodedView) -> Result<Masks> {
         let view = &self.views[index];
         let mut masks = Masks::new();
         for (phrase, target) in &self.targets[index] {
             let Some(prompt) = self.prompts.iter().position(|p| p == phrase) else { continue };
-            let levels = seen.relevancy(prompt);
+            let levels = decoded.relevancy(prompt);
             let boxed: Vec<Image<f32>> = levels.iter().map(|(_, raw)| filter::box30(raw)).collect();
             let localised = Some(localised(&boxed, target));
             let blended: Vec<Image<f32>> =
@@ -227,19 +229,6 @@ impl Protocol for Lerf {
     }
 
     fn finish(self: Box<Self>) -> ProtocolReport {
-        let figures = |of: &[&Score]| {
-            let mut out = BTreeMap::new();
-            for (_, rule, name) in THRESHOLDS {
-                out.extend(
-                    mean(of.iter().filter(|s| s.rule == rule).map(|s| s.iou)).map(|m| (name.to_string(), m)),
-                );
-            }
-            let first = || of.iter().filter(|s| s.rule == THRESHOLDS[0].1);
-            let hits = first().filter_map(|s| s.localised).map(f64::from);
-            out.extend(mean(hits).map(|m| ("localisation".to_string(), m)));
-            out.insert("pairs".into(), first().count() as f64);
-            out
-        };
         ProtocolReport {
             protocol: ProtocolKind::Lerf,
             definitions: [
@@ -260,25 +249,43 @@ impl Protocol for Lerf {
     }
 }
 
+/// Figures of the scores of one split.
+fn figures(scores: &[&Score]) -> BTreeMap<String, f64> {
+    let mut out = BTreeMap::new();
+    for (_, rule, name) in THRESHOLDS {
+        let miou = mean(scores.iter().filter(|s| s.rule == rule).map(|s| s.iou));
+        out.extend(miou.map(|m| (name.to_string(), m)));
+    }
+    let main = || scores.iter().filter(|s| s.rule == THRESHOLDS[0].1);
+    let hits = main().filter_map(|s| s.localised).map(f64::from);
+    out.extend(mean(hits).map(|m| ("localisation".to_string(), m)));
+    out.insert("pairs".into(), main().count() as f64);
+    out
+}
+
 fn peak(map: &Image<f32>) -> f32 {
     map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
-/// Index of the map with the highest peak, the first of equals.
+/// Index of the map with the highest peak; the first of equals.
 fn highest_level(maps: &[Image<f32>]) -> Option<usize> {
     let peaks: Vec<f32> = maps.iter().map(peak).collect();
     let top = peaks.iter().copied().fold(f32::NEG_INFINITY, f32::max);
     peaks.iter().position(|&p| p >= top)
 }
 
-/// Whether any pixel with the highest value of the best level lies in any box.
+/// Whether a pixel with the maximum of the best level lies in a box.
 fn localised(boxed: &[Image<f32>], target: &Target) -> bool {
     let Some(map) = highest_level(boxed).map(|k| &boxed[k]) else { return false };
     let top = peak(map);
-    let to_label = |p: usize, from: usize, to: usize| (p as f64 + 0.5) * to as f64 / from as f64 - 0.5;
     map.data.iter().enumerate().filter(|(_, v)| **v == top).any(|(p, _)| {
-        let x = to_label(p % map.width, map.width, target.mask.width);
-        let y = to_label(p / map.width, map.height, target.mask.height);
+        let x = rescaled(p % map.width, map.width, target.mask.width);
+        let y = rescaled(p / map.width, map.height, target.mask.height);
         target.boxes.iter().any(|b| x >= b[0] && y >= b[1] && x <= b[2] && y <= b[3])
     })
+}
+
+/// Pixel index of the centre of pixel `p` after resizing an axis.
+fn rescaled(p: usize, from: usize, to: usize) -> f64 {
+    (p as f64 + 0.5) * to as f64 / from as f64 - 0.5
 }

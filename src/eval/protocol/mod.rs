@@ -2,8 +2,8 @@
 //! (docs/internals/method.md#protocols).
 //!
 //! [`open`] reads a data set's labels and lists the cameras to render and the texts to query; the
-//! caller renders and decodes each frame and hands it to [`Protocol::add`]; [`Protocol::finish`]
-//! gives the figures with the definitions they follow. The project's own protocol, `field`, is
+//! caller renders and decodes each frame and passes it to [`Protocol::add`]; [`Protocol::finish`]
+//! returns the scores with their definitions. The project's own protocol, `field`, is
 //! [`crate::eval`].
 mod labels;
 mod lerf;
@@ -25,7 +25,7 @@ use crate::Result;
 use crate::scene::Camera;
 use std::path::Path;
 
-/// What `folder` labels, frame by frame.
+/// Reads the labels of a folder, frame by frame.
 pub fn labels(kind: ProtocolKind, folder: &Path) -> Result<Labels> {
     match kind {
         ProtocolKind::Lerf => lerf::labels(folder),
@@ -34,7 +34,7 @@ pub fn labels(kind: ProtocolKind, folder: &Path) -> Result<Labels> {
     }
 }
 
-/// Reads the labels of `folder`. `scene` are the scene's cameras; `known` the data set's own
+/// Opens a data set under a protocol. `scene` holds the scene's cameras; `known` the data set's own
 /// cameras, which place the frames that the scene was not made from (without them only the scene's
 /// own photos are scored).
 pub fn open(

@@ -1,9 +1,9 @@
 //! 3D-OVS (docs/internals/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and
 //! the data set's own argmax.
-use super::labels::{Labels, numbered, painted};
+use super::labels::{Labels, numbered, paint};
 use super::score::{
-    DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score, mask_iou,
-    mean, nearest, place, summarise,
+    DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score,
+    labelled_views, mask_iou, mean, nearest, summarise,
 };
 use crate::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, ObjectMaps, Split};
 use crate::scene::{Camera, Image};
@@ -12,29 +12,29 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// τ of the paper: relevancy above which a pixel belongs to the answer.
+/// τ of the paper: minimum relevancy of a pixel of the answer.
 const TAU: f32 = 0.8;
-/// Smallest mask of a level that may answer, pixels (paper).
+/// Minimum mask of a level that may answer, pixels (paper).
 const AREA: usize = 2000;
-/// Where no level passes: share of the best level's maximum that cuts the mask instead.
+/// Threshold if no level passes: share of the maximum of the best level.
 const SUBSTITUTE: f32 = 0.95;
-/// Share of the maximal cosine that cuts the mask in the authors' script (its default; per scene
-/// .75 to .95).
+/// Threshold of the authors' script: share of the maximal cosine (its default; per scene .75 to
+/// .95).
 const BAR: f32 = 0.85;
-/// Smallest mask there, pixels.
+/// Minimum mask in the authors' script, pixels.
 const AUTHORS_AREA: usize = 3000;
 
 const PAPER: &str = "paper";
 const AUTHORS: &str = "authors";
 const ARGMAX: &str = "argmax";
 
-/// The labels and what was scored so far.
+/// Labels, and the scores so far.
 pub(super) struct Ovs {
     views: Vec<LabelledView>,
     source: LabelSource,
     classes: Vec<String>,
     scores: Vec<Score>,
-    /// Per split: labelled pixels, those whose class was found.
+    /// Labelled pixels and correctly classified ones per split.
     pixels: BTreeMap<&'static str, [u64; 2]>,
 }
 
@@ -48,51 +48,53 @@ impl Ovs {
     pub fn open(folder: &Path, scene: &[Camera], known: &[Camera]) -> Result<Self> {
         let (views, classes, source) = match OwnLabels::open(folder, scene)? {
             Some(own) => {
-                // The argmax needs every label to compete, also those of the background.
+                // The argmax needs every label as a competitor, background labels included.
                 let classes = own.truth.labels.values().cloned().collect();
                 (own.views.clone(), classes, LabelSource::Own(own))
             }
             None => {
-                let root = root(folder);
+                let root = label_folder(folder);
                 let classes = read_classes(&root)?;
-                (place(&frames(&root)?, scene, known)?, classes, LabelSource::Folder(root))
+                (labelled_views(&frames(&root)?, scene, known)?, classes, LabelSource::Folder(root))
             }
         };
         Ok(Ovs { views, source, classes, scores: Vec::new(), pixels: BTreeMap::new() })
     }
 
-    /// Mask per class of a frame; `None` where the frame does not label it.
+    /// Mask per class of a frame; `None` if the frame does not label it.
     fn truth(&self, view: &LabelledView) -> Result<Vec<Option<Image<bool>>>> {
         match &self.source {
             LabelSource::Folder(root) => {
-                let one = |class: &String| {
+                let class_mask = |class: &String| {
                     let path = root.join(&view.stem).join(format!("{class}.png"));
                     path.is_file().then(|| read_mask(&path)).transpose()
                 };
-                self.classes.iter().map(one).collect()
+                self.classes.iter().map(class_mask).collect()
             }
             LabelSource::Own(own) => {
                 let Some(objects) = own.objects(view)? else { return Ok(vec![None; self.classes.len()]) };
-                let one = |label: &u32| {
-                    let data: Vec<bool> = objects.data.iter().map(|o| o == label).collect();
-                    let enough = data.iter().filter(|&&m| m).count() >= MIN_OBJECT_PIXELS;
-                    enough.then_some(Image { width: objects.width, height: objects.height, data })
-                };
-                Ok(own.truth.labels.keys().map(one).collect())
+                Ok(own.truth.labels.keys().map(|label| object_mask(&objects, *label)).collect())
             }
         }
     }
 }
 
-/// The folder of the labels in that of a scene.
-fn root(folder: &Path) -> PathBuf {
+/// Mask of an object with at least [`MIN_OBJECT_PIXELS`].
+fn object_mask(objects: &Image<u32>, label: u32) -> Option<Image<bool>> {
+    let data: Vec<bool> = objects.data.iter().map(|&o| o == label).collect();
+    let enough = data.iter().filter(|&&m| m).count() >= MIN_OBJECT_PIXELS;
+    enough.then_some(Image { width: objects.width, height: objects.height, data })
+}
+
+/// Label folder of a scene's folder.
+fn label_folder(folder: &Path) -> PathBuf {
     let inner = folder.join("segmentations");
     if inner.is_dir() { inner } else { folder.to_path_buf() }
 }
 
-/// The labels as one plane per frame.
+/// Reads the labels as one image of object indices per frame.
 pub(super) fn labels(folder: &Path) -> Result<Labels> {
-    let root = root(folder);
+    let root = label_folder(folder);
     let classes = read_classes(&root)?;
     let (stems, phrases) = (frames(&root)?, numbered(classes));
     let maps = Arc::new(Maps { root, phrases: phrases.clone() });
@@ -114,7 +116,7 @@ impl ObjectMaps for Maps {
                 masks.push((*label, read_mask(&path)?));
             }
         }
-        Ok(painted(masks))
+        Ok(paint(masks))
     }
 }
 
@@ -149,10 +151,10 @@ fn read_mask(path: &Path) -> Result<Image<bool>> {
     Ok(Image { width: image.width() as usize, height: image.height() as usize, data })
 }
 
-/// An answer: mask, level, whether the substitute was needed.
+/// An answer: mask, level, whether the substitute threshold applied.
 pub(super) type Answer = (Image<bool>, usize, bool);
 
-fn cut(map: &Image<f32>, above: f32) -> Image<bool> {
+fn threshold(map: &Image<f32>, above: f32) -> Image<bool> {
     Image { width: map.width, height: map.height, data: map.data.iter().map(|&v| v > above).collect() }
 }
 
@@ -160,16 +162,16 @@ fn area(mask: &Image<bool>) -> usize {
     mask.data.iter().filter(|&&m| m).count()
 }
 
-fn top(map: &Image<f32>) -> f32 {
+fn maximum(map: &Image<f32>) -> f32 {
     map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
-/// The paper: relevancy above τ per level; of the levels with more than 2000 such pixels, the one
-/// with the highest mean.
+/// Rule of the paper: relevancy above τ per level; of the levels with more than 2000 such pixels,
+/// the one with the highest mean.
 pub(super) fn paper_rule(levels: &[(usize, Image<f32>)]) -> Option<Answer> {
     let mut best: Option<(f64, Answer)> = None;
     for (level, map) in levels {
-        let mask = cut(map, TAU);
+        let mask = threshold(map, TAU);
         let pixels = area(&mask);
         if pixels <= AREA {
             continue;
@@ -183,19 +185,19 @@ pub(super) fn paper_rule(levels: &[(usize, Image<f32>)]) -> Option<Answer> {
     if let Some((_, answer)) = best {
         return Some(answer);
     }
-    let peak = levels.iter().map(|(_, m)| top(m)).fold(f32::NEG_INFINITY, f32::max);
-    let (level, map) = levels.iter().find(|(_, m)| top(m) >= peak)?;
-    Some((cut(map, SUBSTITUTE * peak), *level, true))
+    let peak = levels.iter().map(|(_, m)| maximum(m)).fold(f32::NEG_INFINITY, f32::max);
+    let (level, map) = levels.iter().find(|(_, m)| maximum(m) >= peak)?;
+    Some((threshold(map, SUBSTITUTE * peak), *level, true))
 }
 
-/// The authors' script: cosine above 0.85 of its maximum on the levels m and l; the level with the
-/// largest mask.
+/// Rule of the authors' script: cosine above 0.85 of its maximum on the levels m and l; the level
+/// with the largest mask.
 pub(super) fn authors_rule(levels: &[(usize, Image<f32>)]) -> Option<Answer> {
     let coarse: Vec<&(usize, Image<f32>)> = levels.iter().filter(|(l, _)| *l > 0).collect();
     let coarse = if coarse.is_empty() { levels.iter().collect() } else { coarse };
     let mut best: Option<(usize, Answer)> = None;
     for (level, map) in coarse {
-        let mask = cut(map, BAR * top(map));
+        let mask = threshold(map, BAR * maximum(map));
         let pixels = area(&mask);
         if best.as_ref().is_none_or(|(n, _)| pixels > *n) {
             best = Some((pixels, (mask, *level, pixels <= AUTHORS_AREA)));
@@ -213,11 +215,11 @@ impl Protocol for Ovs {
         self.classes.clone()
     }
 
-    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks> {
+    fn add(&mut self, index: usize, decoded: &DecodedView) -> Result<Masks> {
         let view = self.views[index].clone();
         let truth = self.truth(&view)?;
         let (mut masks, classes) = (Masks::new(), self.classes.clone());
-        let best = seen.best_prompt()?;
+        let best = decoded.best_prompt()?;
         let mut push = |class: usize, rule, iou, level, substituted| {
             self.scores.push(Score {
                 frame: view.stem.clone(),
@@ -238,11 +240,11 @@ impl Protocol for Ovs {
             if BACKGROUND_LABELS.contains(&classes[class].as_str()) {
                 continue;
             }
-            if let Some((mask, level, substituted)) = paper_rule(&seen.relevancy(class)) {
+            if let Some((mask, level, substituted)) = paper_rule(&decoded.relevancy(class)) {
                 push(class, PAPER, mask_iou(&mask, target)?, Some(level), substituted);
                 masks.push((classes[class].clone(), mask));
             }
-            if let Some((mask, level, substituted)) = authors_rule(&seen.cosine(class)) {
+            if let Some((mask, level, substituted)) = authors_rule(&decoded.cosine(class)) {
                 push(class, AUTHORS, mask_iou(&mask, target)?, Some(level), substituted);
             }
         }
@@ -253,22 +255,6 @@ impl Protocol for Ovs {
     }
 
     fn finish(self: Box<Self>) -> ProtocolReport {
-        let figures = |of: &[&Score]| {
-            let mut out = BTreeMap::new();
-            for (rule, name) in [(PAPER, "miou"), (AUTHORS, "miou_authors"), (ARGMAX, "miou_argmax")] {
-                out.extend(
-                    mean(of.iter().filter(|s| s.rule == rule).map(|s| s.iou)).map(|m| (name.to_string(), m)),
-                );
-            }
-            let split = of.first().map_or(Split::Train, |s| s.split);
-            if let Some([all, right]) = self.pixels.get(split.name()).filter(|p| p[0] > 0) {
-                out.insert("accuracy_argmax".into(), *right as f64 / *all as f64);
-            }
-            out.insert("pairs".into(), of.iter().filter(|s| s.rule == PAPER).count() as f64);
-            let substituted = of.iter().filter(|s| s.rule == PAPER && s.substituted).count();
-            out.insert("substituted".into(), substituted as f64);
-            out
-        };
         ProtocolReport {
             protocol: ProtocolKind::Ovs,
             definitions: [
@@ -283,27 +269,44 @@ impl Protocol for Ovs {
             ]
             .map(String::from)
             .to_vec(),
-            summary: summarise(&self.scores, PAPER, figures),
+            summary: summarise(&self.scores, PAPER, |scores| figures(scores, &self.pixels)),
             main_rule: PAPER,
             scores: self.scores,
         }
     }
 }
 
-/// (labelled pixels, those whose class was found). A pixel of several classes is right with any of
-/// them.
+/// Figures of the scores of one split; `pixels` are those of [`Ovs::pixels`].
+fn figures(scores: &[&Score], pixels: &BTreeMap<&'static str, [u64; 2]>) -> BTreeMap<String, f64> {
+    let mut out = BTreeMap::new();
+    for (rule, name) in [(PAPER, "miou"), (AUTHORS, "miou_authors"), (ARGMAX, "miou_argmax")] {
+        let miou = mean(scores.iter().filter(|s| s.rule == rule).map(|s| s.iou));
+        out.extend(miou.map(|m| (name.to_string(), m)));
+    }
+    let split = scores.first().map_or(Split::Train, |s| s.split);
+    if let Some([all, right]) = pixels.get(split.name()).filter(|p| p[0] > 0) {
+        out.insert("accuracy_argmax".into(), *right as f64 / *all as f64);
+    }
+    out.insert("pairs".into(), scores.iter().filter(|s| s.rule == PAPER).count() as f64);
+    let substituted = scores.iter().filter(|s| s.rule == PAPER && s.substituted).count();
+    out.insert("substituted".into(), substituted as f64);
+    out
+}
+
+/// (labelled pixels, correctly classified ones). Any of its classes is correct for a pixel of
+/// several.
 fn accuracy(best: &Image<i32>, truth: &[Option<Image<bool>>]) -> [u64; 2] {
     let Some(size) = truth.iter().flatten().next() else { return [0, 0] };
     let (mut all, mut right) = (0, 0);
     for y in 0..size.height {
         for x in 0..size.width {
-            let at = |m: &Image<bool>| nearest(m, (x, y), (size.width, size.height));
-            if !truth.iter().flatten().any(at) {
+            let has_label = |m: &Image<bool>| nearest(m, (x, y), (size.width, size.height));
+            if !truth.iter().flatten().any(has_label) {
                 continue;
             }
             all += 1;
             let k = nearest(best, (x, y), (size.width, size.height));
-            let hit = usize::try_from(k).ok().and_then(|k| truth.get(k)?.as_ref()).is_some_and(at);
+            let hit = usize::try_from(k).ok().and_then(|k| truth.get(k)?.as_ref()).is_some_and(has_label);
             right += u64::from(hit);
         }
     }

@@ -1,8 +1,9 @@
-//! Polygons to masks, as the label tools of LERF-OVS are read: vertices truncated to whole pixels,
-//! even-odd inside, outline included (what OpenCV's `fillPoly` draws).
+//! Polygons to masks as in the label tools of LERF-OVS: vertices truncated to whole pixels,
+//! even-odd interior, outline included (OpenCV's `fillPoly`).
 use crate::scene::Image;
 
-/// Farthest that a vertex may lie outside, pixels: beyond it products of coordinates leave 64 bits.
+/// Farthest that a vertex may lie outside, pixels: beyond it products of coordinates exceed 64
+/// bits.
 pub const FARTHEST: f64 = 1e6;
 
 /// Sets the pixels of a closed polygon. Vertices may lie outside, up to [`FARTHEST`].
@@ -37,19 +38,19 @@ fn set(mask: &mut Image<bool>, x: i64, y: i64) {
     }
 }
 
-/// Every pixel of an 8-connected line (Bresenham): one per step along the longer axis, rounded
+/// Sets every pixel of an 8-connected line (Bresenham): one per step along the longer axis, rounded
 /// along the other.
 fn outline(mask: &mut Image<bool>, a: [i64; 2], b: [i64; 2]) {
     let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
     let steps = dx.abs().max(dy.abs());
-    // Along the longer axis every step is a pixel: those before and after the image are left out.
+    // Every step along the longer axis is a pixel: steps outside the image are skipped.
     let (from, forward, size) = match dx.abs() >= dy.abs() {
         true => (a[0], dx >= 0, mask.width as i64),
         false => (a[1], dy >= 0, mask.height as i64),
     };
     let (first, last) = if forward { (-from, size - 1 - from) } else { (from - size + 1, from) };
     for k in first.max(0)..=last.min(steps) {
-        let at = |from: i64, d: i64| from + (2 * k * d + steps).div_euclid((2 * steps).max(1));
-        set(mask, at(a[0], dx), at(a[1], dy));
+        let coordinate = |from: i64, d: i64| from + (2 * k * d + steps).div_euclid((2 * steps).max(1));
+        set(mask, coordinate(a[0], dx), coordinate(a[1], dy));
     }
 }

@@ -2,7 +2,7 @@
 use super::labels::{Labels, numbered};
 use super::score::{
     DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary, Score,
-    nearest, place,
+    labelled_views, nearest,
 };
 use crate::eval::{ObjectMaps, Split};
 use crate::photo::{self, stem};
@@ -31,11 +31,11 @@ pub(super) fn from_nyu40(id: u32) -> Option<usize> {
     }
 }
 
-/// The labels and what was counted so far.
+/// Labels, and the counts so far.
 pub(super) struct ScanNet {
     files: LabelFiles,
     views: Vec<LabelledView>,
-    /// Per split, [truth][predicted] pixels; the last column is "nothing there".
+    /// [truth][predicted] pixels per split; the last column is "no code".
     confusion: BTreeMap<&'static str, [[u64; 9]; 8]>,
     scores: Vec<Score>,
 }
@@ -45,7 +45,7 @@ impl ScanNet {
         let scan = Scan::open(folder)?;
         let own = if known.is_empty() { cameras(folder, &scan.stems)? } else { known.to_vec() };
         Ok(ScanNet {
-            views: place(&scan.stems, scene, &own)?,
+            views: labelled_views(&scan.stems, scene, &own)?,
             files: scan.files,
             confusion: BTreeMap::new(),
             scores: Vec::new(),
@@ -57,7 +57,7 @@ impl ScanNet {
 #[derive(Debug)]
 struct LabelFiles {
     folder: PathBuf,
-    /// Raw id → NYU40 id; none: the files hold NYU40 ids.
+    /// Raw id → NYU40 id; `None` if the files hold NYU40 ids.
     table: Option<BTreeMap<u32, u32>>,
 }
 
@@ -69,8 +69,8 @@ struct Scan {
 
 impl Scan {
     fn open(folder: &Path) -> Result<Scan> {
-        let place_of = ["label-filt", "label"].iter().map(|n| folder.join(n)).find(|p| p.is_dir());
-        let labels = place_of.ok_or_else(|| {
+        let labels = ["label-filt", "label"].iter().map(|n| folder.join(n)).find(|p| p.is_dir());
+        let labels = labels.ok_or_else(|| {
             Error::input(format!(
                 "{}: no label-filt/ folder; --protocol scannet wants an unpacked ScanNet scene (color, label-filt, pose, \
                  intrinsic)",
@@ -93,7 +93,6 @@ impl LabelFiles {
     /// Index in [`LABELS`] per pixel, −1 = unlabelled.
     fn truth(&self, stem: &str) -> Result<Image<i32>> {
         let path = self.folder.join(format!("{stem}.png"));
-        let bad = |what: String| Error::input(format!("{}: {what}", path.display()));
         let image = photo::stored_pixels(&path)?.to_luma16();
         let mut out = Image::filled(image.width() as usize, image.height() as usize, -1);
         for (slot, pixel) in out.data.iter_mut().zip(image.pixels()) {
@@ -102,8 +101,9 @@ impl LabelFiles {
                 Some(table) => table.get(&id).copied().unwrap_or(0),
                 None if id <= 40 => id,
                 None => {
-                    return Err(bad(format!(
-                        "id {id} is no NYU40 class; put scannetv2-labels.combined.tsv beside the scene"
+                    return Err(Error::input(format!(
+                        "{}: id {id} is no NYU40 class; put scannetv2-labels.combined.tsv beside the scene",
+                        path.display()
                     )));
                 }
             };
@@ -120,7 +120,7 @@ impl ObjectMaps for LabelFiles {
     }
 }
 
-/// The labels as one plane per frame, and the scan's cameras.
+/// Reads the labels as one image of object indices per frame, and the scan's cameras.
 pub(super) fn labels(folder: &Path) -> Result<Labels> {
     let Scan { files, stems } = Scan::open(folder)?;
     let cameras = cameras(folder, &stems)?;
@@ -140,9 +140,12 @@ fn table(folder: &Path) -> Result<Option<BTreeMap<u32, u32>>> {
     let (Some(id), Some(nyu)) = (column("id"), column("nyu40id")) else {
         return Err(Error::input(format!("{}: no columns id and nyu40id", path.display())));
     };
-    let number = |cells: &[&str], k: usize| cells.get(k).and_then(|c| c.trim().parse().ok());
     let rows = lines.map(|l| l.split('\t').collect::<Vec<_>>());
-    Ok(Some(rows.filter_map(|c| Some((number(&c, id)?, number(&c, nyu)?))).collect()))
+    Ok(Some(rows.filter_map(|c| Some((number_in(&c, id)?, number_in(&c, nyu)?))).collect()))
+}
+
+fn number_in(cells: &[&str], column: usize) -> Option<u32> {
+    cells.get(column).and_then(|c| c.trim().parse().ok())
 }
 
 /// Numbers of a text matrix, row by row.
@@ -174,8 +177,8 @@ fn cameras(folder: &Path, stems: &[String]) -> Result<Vec<Camera>> {
         let pose = to_world.inverse();
         let camera =
             Camera { name: name.clone(), width, height, fx: k[0], fy: k[5], cx: k[2], cy: k[6], pose };
-        let named = |e: String| Error::input(format!("{}: {e}", folder.join("pose").display()));
-        out.push(camera.checked().map_err(named)?);
+        let camera = camera.checked();
+        out.push(camera.map_err(|e| Error::input(format!("{}: {e}", folder.join("pose").display())))?);
     }
     Ok(out)
 }
@@ -189,9 +192,9 @@ impl Protocol for ScanNet {
         LABELS.map(String::from).to_vec()
     }
 
-    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks> {
+    fn add(&mut self, index: usize, decoded: &DecodedView) -> Result<Masks> {
         let view = self.views[index].clone();
-        let (truth, best) = (self.files.truth(&view.stem)?, seen.best_prompt()?);
+        let (truth, best) = (self.files.truth(&view.stem)?, decoded.best_prompt()?);
         let mut counts = [[0u64; 9]; 8];
         for y in 0..truth.height {
             for x in 0..truth.width {

@@ -1,4 +1,4 @@
-//! What the protocols share: frames, scores, and the decoded views of a scene.
+//! Frames and scores of all protocols, and the decoded views of a scene.
 use crate::eval::{Evaluation, GroundTruth, Split, to_scene};
 use crate::photo::{join, stem};
 use crate::pose::align::pose_errors;
@@ -10,7 +10,7 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// Which published protocol.
+/// A published protocol.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
@@ -24,18 +24,18 @@ pub enum ProtocolKind {
     ScanNet,
 }
 
-/// A frame to look from.
+/// A labelled frame with its camera.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelledView {
     /// File stem, the key of its labels.
     pub stem: String,
     /// Train = the scene was made from this photo.
     pub split: Split,
-    /// In the scene's world.
+    /// Camera in the scene's world.
     pub camera: Camera,
 }
 
-/// One prompt in one frame under one rule.
+/// Score of one prompt in one frame under one rule.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct Score {
@@ -45,15 +45,16 @@ pub struct Score {
     pub split: Split,
     /// The text of the query.
     pub phrase: String,
-    /// How the mask was cut.
+    /// Rule that cut the mask.
     pub rule: &'static str,
     /// Intersection over union with the truth.
     pub iou: f64,
-    /// Level that answered, 0 = s; none where all levels compete per pixel.
+    /// Level that answered, 0 = s; `None` if all levels compete per pixel.
     pub level: Option<usize>,
-    /// The most relevant pixel lies in a box of the truth, where the protocol asks for that.
+    /// Whether the most relevant pixel lies in a box of the truth; `None` if the protocol has no
+    /// boxes.
     pub localised: Option<bool>,
-    /// No level met the rule, and its substitute answered.
+    /// Whether no level met the rule, and its substitute answered.
     pub substituted: bool,
 }
 
@@ -67,35 +68,35 @@ pub struct ProtocolSummary {
     pub iou: BTreeMap<String, f64>,
 }
 
-/// The figures and what they mean.
+/// Scores of a data set, with their definitions.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[non_exhaustive]
 pub struct ProtocolReport {
     /// Name of the protocol.
     pub protocol: ProtocolKind,
-    /// What each figure is, one line each.
+    /// Definitions of the figures, one line each.
     pub definitions: Vec<String>,
     /// The [`Score::rule`] behind `miou`.
     #[serde(skip)]
     pub main_rule: &'static str,
-    /// Every single score.
+    /// All scores.
     pub scores: Vec<Score>,
-    /// Per split that has frames.
+    /// Means per split that has frames.
     pub summary: BTreeMap<String, ProtocolSummary>,
 }
 
-/// A predicted mask, for whoever wants to keep it: (phrase, mask).
+/// Predicted masks: (phrase, mask).
 pub type Masks = Vec<(String, Image<bool>)>;
 
 /// A data set under a protocol.
 pub trait Protocol {
     /// Labelled frames that have a camera.
     fn views(&self) -> &[LabelledView];
-    /// The texts to query, in the order that [`CodeScores`] holds them.
+    /// Texts of the queries, in the order of [`CodeScores`].
     fn prompts(&self) -> Vec<String>;
     /// Scores the frame `views()[index]`; returns the masks of the protocol's first rule.
-    fn add(&mut self, index: usize, seen: &DecodedView) -> Result<Masks>;
-    /// The figures.
+    fn add(&mut self, index: usize, decoded: &DecodedView) -> Result<Masks>;
+    /// Computes the summaries and returns the report.
     fn finish(self: Box<Self>) -> ProtocolReport;
 }
 
@@ -126,37 +127,34 @@ impl CodeScores {
 
 /// One decoded frame.
 pub struct DecodedView<'a> {
-    /// Per level, code per pixel, −1 = nothing there.
+    /// Code per level and pixel, −1 = none.
     pub codes: &'a [Image<i32>],
     /// Scores of those codes.
     pub scores: &'a CodeScores,
 }
 
 impl DecodedView<'_> {
-    /// (level, relevancy map) of the levels that have codes; 0 where nothing is.
+    /// (level, relevancy map) of the levels with codes; 0 for pixels without code.
     pub(super) fn relevancy(&self, prompt: usize) -> Vec<(usize, Image<f32>)> {
         let levels = self.codes.iter().zip(&self.scores.relevancy[prompt]).enumerate();
         let levels_with_codes = levels.filter(|(_, (_, values))| !values.is_empty());
         levels_with_codes.map(|(level, (codes, values))| (level, relevancy_map(codes, values))).collect()
     }
 
-    /// (level, cosine map) of the levels that have codes; −∞ where nothing is.
+    /// (level, cosine map) of the levels with codes; −∞ for pixels without code.
     pub(super) fn cosine(&self, prompt: usize) -> Vec<(usize, Image<f32>)> {
         let levels = self.codes.iter().zip(&self.scores.cosine[prompt]).enumerate();
         let levels_with_codes = levels.filter(|(_, (_, values))| !values.is_empty());
-        let at = |values: &[f32], k: i32| {
-            usize::try_from(k).ok().and_then(|k| values.get(k)).copied().unwrap_or(f32::NEG_INFINITY)
-        };
         levels_with_codes
             .map(|(level, (codes, values))| {
-                let data = codes.data.par_iter().map(|&k| at(values, k)).collect();
+                let data = codes.data.par_iter().map(|&k| cosine_of(values, k)).collect();
                 (level, Image { width: codes.width, height: codes.height, data })
             })
             .collect()
     }
 
-    /// Per pixel the prompt with the highest cosine at any level, −1 where nothing is; ties go to
-    /// the earlier prompt.
+    /// Prompt with the highest cosine at any level per pixel, −1 for pixels without code; ties go
+    /// to the earlier prompt.
     pub(super) fn best_prompt(&self) -> Result<Image<i32>> {
         let size =
             self.codes.first().ok_or_else(|| Error::work("the scene has no language level to query"))?;
@@ -175,15 +173,20 @@ impl DecodedView<'_> {
     }
 }
 
-/// Value of the pixel of `map` under the centre of pixel (x, y) of an image of another size.
+/// Cosine of a code; −∞ for no code.
+fn cosine_of(values: &[f32], code: i32) -> f32 {
+    usize::try_from(code).ok().and_then(|k| values.get(k)).copied().unwrap_or(f32::NEG_INFINITY)
+}
+
+/// Value of `map` under the centre of pixel (x, y) of an image of another size.
 pub(super) fn nearest<T: Copy>(map: &Image<T>, (x, y): (usize, usize), (width, height): (usize, usize)) -> T {
     let mx = ((x as f64 + 0.5) * map.width as f64 / width as f64) as usize;
     let my = ((y as f64 + 0.5) * map.height as f64 / height as f64) as usize;
     map.at(mx.min(map.width - 1), my.min(map.height - 1))
 }
 
-/// Intersection over union; the prediction is resampled to the truth's size by nearest pixel. 0
-/// when both are empty.
+/// Intersection over union; the prediction is resampled to the truth's size by nearest pixel. 0 if
+/// both are empty.
 pub(super) fn mask_iou(predicted: &Image<bool>, truth: &Image<bool>) -> Result<f64> {
     if predicted.data.is_empty() {
         return Err(Error::work("eval: a mask without pixels"));
@@ -199,10 +202,13 @@ pub(super) fn mask_iou(predicted: &Image<bool>, truth: &Image<bool>) -> Result<f
     Ok(both as f64 / either.max(1) as f64)
 }
 
-/// Where the labelled frames stand: the scene's own cameras for its photos; for others the known
-/// ones, carried over by the similarity that the shared photos give.
-pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Result<Vec<LabelledView>> {
-    let own = |s: &str| scene.iter().find(|c| stem(&c.name) == s);
+/// Cameras of the labelled frames: the scene's own for its photos; for others the known ones,
+/// transformed by the similarity of the shared photos.
+pub(super) fn labelled_views(
+    stems: &[String],
+    scene: &[Camera],
+    known: &[Camera],
+) -> Result<Vec<LabelledView>> {
     let names: Vec<&str> = known.iter().map(|c| c.name.as_str()).collect();
     let joined = |list: &[&str]| join(list, &names).map_err(|e| Error::input(format!("--cameras: {e}")));
     let of_scene = joined(&scene.iter().map(|c| c.name.as_str()).collect::<Vec<_>>())?;
@@ -210,14 +216,14 @@ pub(super) fn place(stems: &[String], scene: &[Camera], known: &[Camera]) -> Res
     let pairs = scene.iter().zip(of_scene);
     let shared: Vec<(Camera, Camera)> =
         pairs.filter_map(|(c, k)| Some((c.clone(), known[k?].clone()))).collect();
-    // One shared photo leaves the scale open.
+    // The similarity needs two shared photos for its scale.
     let similarity = (shared.len() >= 2).then(|| {
         let (estimated, truth): (Vec<_>, Vec<_>) = shared.into_iter().unzip();
         pose_errors(&estimated, &truth, 1.0).similarity
     });
     let mut views = Vec::new();
     for (name, known_as) in stems.iter().zip(of_labels) {
-        if let Some(camera) = own(name) {
+        if let Some(camera) = scene.iter().find(|c| stem(&c.name) == *name) {
             views.push(LabelledView { stem: name.clone(), split: Split::Train, camera: camera.clone() });
         } else if let (Some(s), Some(k)) = (&similarity, known_as) {
             views.push(LabelledView {
@@ -252,12 +258,9 @@ impl OwnLabels {
         let truth = GroundTruth::read(folder)?;
         let evaluation = Evaluation::new(truth.clone(), scene, None)?;
         let phrases = evaluation.phrases();
-        let view = |(f, camera): (crate::eval::TruthFrame, Camera)| LabelledView {
-            stem: f.stem,
-            split: f.split,
-            camera,
-        };
-        Ok(Some(OwnLabels { truth, views: evaluation.cameras().into_iter().map(view).collect(), phrases }))
+        let cameras = evaluation.cameras().into_iter();
+        let views = cameras.map(|(f, camera)| LabelledView { stem: f.stem, split: f.split, camera });
+        Ok(Some(OwnLabels { truth, views: views.collect(), phrases }))
     }
 
     /// Object index per pixel of a view.
@@ -274,7 +277,7 @@ pub(super) fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
     (n > 0).then(|| sum / n as f64)
 }
 
-/// Per split with scores: `figures` of it, and the mean IoU per phrase under `rule`.
+/// Summary per split with scores: `figures`, and the mean IoU per phrase under `rule`.
 pub(super) fn summarise(
     scores: &[Score],
     rule: &str,
@@ -282,16 +285,16 @@ pub(super) fn summarise(
 ) -> BTreeMap<String, ProtocolSummary> {
     let mut out = BTreeMap::new();
     for split in [Split::Train, Split::Test] {
-        let of: Vec<&Score> = scores.iter().filter(|s| s.split == split).collect();
-        if of.is_empty() {
+        let scores: Vec<&Score> = scores.iter().filter(|s| s.split == split).collect();
+        if scores.is_empty() {
             continue;
         }
         let mut iou: BTreeMap<String, Vec<f64>> = BTreeMap::new();
-        for s in of.iter().filter(|s| s.rule == rule) {
+        for s in scores.iter().filter(|s| s.rule == rule) {
             iou.entry(s.phrase.clone()).or_default().push(s.iou);
         }
         let iou = iou.into_iter().filter_map(|(k, v)| mean(v.into_iter()).map(|m| (k, m))).collect();
-        out.insert(split.name().to_string(), ProtocolSummary { figures: figures(&of), iou });
+        out.insert(split.name().to_string(), ProtocolSummary { figures: figures(&scores), iou });
     }
     out
 }

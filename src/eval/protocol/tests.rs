@@ -35,14 +35,14 @@ fn query(text: &str, random: &mut Random) -> TextQuery {
     }
 }
 
-/// Blocks of random codes, some void.
+/// Blocks of random codes, some without code.
 fn codes(width: usize, height: usize, random: &mut Random) -> Vec<Image<i32>> {
-    let one = |random: &mut Random| {
+    let level = |random: &mut Random| {
         let blocks: Vec<i32> = (0..48).map(|_| (random.uniform() * 6.0) as i32 - 1).collect();
         let data = (0..width * height).map(|p| blocks[p / width * 6 / height * 8 + p % width * 8 / width]);
         Image { width, height, data: data.collect() }
     };
-    vec![one(random), Image::filled(width, height, -1), one(random)]
+    vec![level(random), Image::filled(width, height, -1), level(random)]
 }
 
 /// Relevancy of a vector in f64.
@@ -64,18 +64,6 @@ fn oracle_map(field: &LanguageField, codes: &[Image<i32>], level: usize, q: &Tex
 
 /// Brute-force 30×30 mean, anchor 15, reflection without the edge.
 fn oracle_box(map: &[f64], w: usize, h: usize) -> Vec<f64> {
-    let reflect = |i: isize, n: usize| -> usize {
-        let mut i = i;
-        loop {
-            if i < 0 {
-                i = -i;
-            } else if i >= n as isize {
-                i = 2 * (n as isize - 1) - i;
-            } else {
-                return i as usize;
-            }
-        }
-    };
     let mut out = vec![0.0; w * h];
     for y in 0..h as isize {
         for x in 0..w as isize {
@@ -89,6 +77,19 @@ fn oracle_box(map: &[f64], w: usize, h: usize) -> Vec<f64> {
         }
     }
     out
+}
+
+/// Index after reflection at both ends.
+fn reflect(mut i: isize, n: usize) -> usize {
+    loop {
+        if i < 0 {
+            i = -i;
+        } else if i >= n as isize {
+            i = 2 * (n as isize - 1) - i;
+        } else {
+            return i as usize;
+        }
+    }
 }
 
 fn maximum(v: &[f64]) -> f64 {
@@ -150,7 +151,7 @@ fn lerf_label() -> serde_json::Value {
 }
 
 #[test]
-fn lerf_equals_a_plain_computation() {
+fn lerf_equals_plain_computation() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("frame_00001.json"), lerf_label().to_string()).unwrap();
     let scene = [camera("frame_00001", 0.0, (W as u32, H as u32))];
@@ -189,12 +190,12 @@ fn lerf_equals_a_plain_computation() {
                 })
                 .collect();
             let iou = oracle_iou(&mask, &truth);
-            let of = report.scores.iter().find(|s| s.phrase == q.text && s.rule == "thr0.6").unwrap();
-            assert!((of.iou - iou).abs() < 1e-12, "seed {seed}: {} {iou}", of.iou);
-            assert_eq!(of.level, Some([0, 2][level]));
+            let score = report.scores.iter().find(|s| s.phrase == q.text && s.rule == "thr0.6").unwrap();
+            assert!((score.iou - iou).abs() < 1e-12, "seed {seed}: {} {iou}", score.iou);
+            assert_eq!(score.level, Some([0, 2][level]));
             ious.push(iou);
             let best = usize::from(maximum(&boxed[1]) > maximum(&boxed[0]));
-            // f32 sums in the program: pixels within rounding of the top may be the top there
+            // The program sums in f32: pixels within rounding of the top may be its top.
             let top = maximum(&boxed[best]);
             let near = |slack: f64| -> Vec<usize> {
                 (0..W * H).filter(|&p| boxed[best][p] >= top - slack).collect()
@@ -207,7 +208,7 @@ fn lerf_equals_a_plain_computation() {
             };
             let (exact, close) = (near(0.0).iter().any(inside), near(1e-6).iter().any(inside));
             if exact == close {
-                assert_eq!(of.localised, Some(exact), "seed {seed} {}", q.text);
+                assert_eq!(score.localised, Some(exact), "seed {seed} {}", q.text);
             }
         }
         let summary = &report.summary["train"];
@@ -217,7 +218,7 @@ fn lerf_equals_a_plain_computation() {
 }
 
 #[test]
-fn lerf_ties_go_to_the_finer_level_and_larger_labels_resample() {
+fn lerf_ties_prefer_finer_level() {
     let folder = tempfile::tempdir().unwrap();
     let label = serde_json::json!({
         "info": {"name": "a.jpg", "width": 2 * W, "height": 2 * H},
@@ -401,7 +402,7 @@ fn ovs_rules_equal_plain_computations() {
 }
 
 #[test]
-fn scannet_counts_eight_labels_and_places_frames_by_their_poses() {
+fn scannet_counts_labels_and_places_frames() {
     let folder = tempfile::tempdir().unwrap();
     let dir = folder.path().join("scene0000_00");
     for sub in ["color", "label-filt", "pose", "intrinsic"] {
@@ -508,14 +509,13 @@ fn scannet_counts_eight_labels_and_places_frames_by_their_poses() {
 }
 
 #[test]
-fn own_ground_truth_serves_lerf_and_ovs() {
+fn ground_truth_serves_lerf_and_ovs() {
     let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast"));
     let truth = GroundTruth::read(folder).unwrap();
     let scene: Vec<Camera> =
         truth.frames.iter().filter(|f| f.split == Split::Train).map(|f| f.camera.clone()).collect();
     let objects = truth.objects(&truth.frames[0]).unwrap().unwrap();
-    // codes = object indices, embeddings = unit axes, prompts = the axes: everything is found
-    // exactly
+    // Codes = object indices, embeddings = unit axes, prompts = the axes: every answer is exact.
     let mut embeddings = vec![0.0f32; 12 * 13];
     (0..12).for_each(|k| embeddings[k * 13 + k] = 1.0);
     let codebook = Codebook { embedding_dim: 13, code_dim: 1, embeddings, ..Codebook::default() };
@@ -541,7 +541,7 @@ fn own_ground_truth_serves_lerf_and_ovs() {
         protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
         let ProtocolSummary { figures, iou } = protocol.finish().summary["train"].clone();
         assert_eq!(figures[figure], 1.0, "{kind:?}");
-        // The table is a label that competes, and no thing to find.
+        // The table competes as a label, but is no object to find.
         assert!(iou.contains_key("lemon") && !iou.contains_key("wooden table"), "{kind:?}: {iou:?}");
         match kind {
             // masks are cut from smoothed maps: edges and thin parts move
@@ -552,16 +552,16 @@ fn own_ground_truth_serves_lerf_and_ovs() {
 }
 
 #[test]
-fn folders_of_another_layout_are_refused() {
+fn protocols_refuse_folders_of_other_layouts() {
     let folder = tempfile::tempdir().unwrap();
     let scene = [camera("a", 0.0, (W as u32, H as u32))];
-    for (kind, says) in [
+    for (kind, expected) in [
         (ProtocolKind::Lerf, "frame_*.json"),
         (ProtocolKind::Ovs, "classes.txt"),
         (ProtocolKind::ScanNet, "label-filt"),
     ] {
         let error = open(kind, folder.path(), &scene, &[]).err().unwrap();
-        assert!(error.exit_code() == 2 && error.to_string().contains(says), "{error}");
+        assert!(error.exit_code() == 2 && error.to_string().contains(expected), "{error}");
     }
     std::fs::write(folder.path().join("b.json"), lerf_label().to_string()).unwrap();
     let error = open(ProtocolKind::Lerf, folder.path(), &scene, &[]).err().unwrap().to_string();

@@ -1,4 +1,4 @@
-//! Depth that is suggested for photos whose depth stereo measures.
+//! Depth priors for photos whose depth stereo measures.
 use super::table::{GraphBuilder, NO_CHECK, Source, SourceKind};
 use crate::Result;
 use crate::infer::depth_prior;
@@ -21,7 +21,7 @@ impl SourceKind for DepthSources {
             about: "stereo alone",
             needs: &[],
             check: NO_CHECK,
-            make: |_, input| add(input, PriorOrigin::None),
+            make: |_, input| add_priors(input, PriorOrigin::None),
         },
         Source {
             name: "dir",
@@ -29,18 +29,18 @@ impl SourceKind for DepthSources {
             about: "STEM_depth.npy or STEM_inverse_depth.npy",
             needs: &[],
             check: |dir, given| depth_prior::of_folder(dir, given.photos).map(drop),
-            make: |dir, input| add(input, PriorOrigin::Folder(dir.to_path_buf())),
+            make: |dir, input| add_priors(input, PriorOrigin::Folder(dir.to_path_buf())),
         },
     ];
     type Input<'i> = (&'i mut GraphBuilder, Output<PlacedPhotos>);
     type Output = Output<Vec<Option<DepthPrior>>>;
 
     fn network(model: Installed, input: Self::Input<'_>) -> Result<Self::Output> {
-        add(input, PriorOrigin::Network(Box::new(model)))
+        add_priors(input, PriorOrigin::Network(Box::new(model)))
     }
 }
 
-fn add(
+fn add_priors(
     (build, placed): (&mut GraphBuilder, Output<PlacedPhotos>),
     origin: PriorOrigin,
 ) -> Result<Output<Vec<Option<DepthPrior>>>> {

@@ -34,7 +34,7 @@ impl SourceKind for FeatureSources {
                 PackFileKind::Tokenizer,
             ],
             check: NO_CHECK,
-            // The models are the default pack's, and that is part of the program.
+            // The models are those of the default pack, which is part of the program.
             make: |_, registry| {
                 Ok(SharedEncoder::new(Box::new(RegionWords::load(registry.clone())?), "words".to_owned()))
             },
@@ -70,13 +70,13 @@ impl SourceKind for FeatureSources {
     }
 }
 
-/// The encoder of a choice, for queries alone.
+/// The encoder of a choice, for queries only.
 pub fn encoder(choice: &SourceChoice, registry: &Registry) -> Result<Box<dyn RegionEncoder>> {
     make::<FeatureSources>(choice, registry, registry)?.into_inner()
 }
 
-/// Refuses texts that the scene could not be asked for, and a table without the canonical phrases
-/// that every answer is held against, while nothing is made of the photos yet.
+/// Refuses, before work on the photos, texts without embedding and a table without the canonical
+/// phrases that every answer is compared with.
 pub fn check_texts(choice: &SourceChoice, queries: &[String], registry: &Registry) -> Result<()> {
     let has_table = text_table(choice).is_some();
     if choice.name != "dir" || (!has_table && queries.is_empty()) {

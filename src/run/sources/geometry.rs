@@ -42,9 +42,9 @@ impl SourceKind for GeometrySources {
 }
 
 impl GraphBuilder {
-    /// Photos with cameras from anywhere, and depth by stereo where a network has not given it.
+    /// Adds photos with cameras of any source, and depth by stereo unless a network gives it.
     pub fn posed(&mut self, photos: Vec<Photo>, source: CameraOrigin) -> Result<PosedPhotos> {
-        // A network that gives depth itself needs none suggested.
+        // A network with depth needs no priors.
         let none = table::default::<DepthSources>();
         let choice = if matches!(source, CameraOrigin::Network(_)) { none } else { self.depth_prior.clone() };
         let placed = self.graph.add(Cameras::new(photos, source, self.seed)?, ());

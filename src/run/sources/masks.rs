@@ -21,7 +21,7 @@ impl SourceKind for MaskSources {
             about: "segmentation by colour and learned edges",
             needs: &[PackFileKind::Edges],
             check: NO_CHECK,
-            make: |_, (build, photos)| Ok(graph(build, photos)),
+            make: |_, (build, photos)| Ok(graph_masks(build, photos)),
         },
         Source {
             name: "dir",
@@ -48,12 +48,12 @@ impl SourceKind for MaskSources {
         if !untrained {
             return Ok(found);
         }
-        let built_in = graph(build, photos);
+        let built_in = graph_masks(build, photos);
         Ok(build.graph.add(MasksOrFallback, (found, built_in)))
     }
 }
 
-fn graph(build: &mut GraphBuilder, photos: PosedPhotos) -> Output<Vec<ViewMasks>> {
+fn graph_masks(build: &mut GraphBuilder, photos: PosedPhotos) -> Output<Vec<ViewMasks>> {
     let edges = build.graph.add(ContourMaps, (photos.placed,));
     build.graph.add(GraphMasks, (photos.placed, edges))
 }

@@ -1,4 +1,4 @@
-//! Dense matches between every two photos, for step 1 of the alignment.
+//! Dense matches between every pair of photos, for step 1 of the alignment.
 use super::table::{GraphBuilder, NO_CHECK, PosedPhotos, Source, SourceKind};
 use crate::Result;
 use crate::infer::PackFileKind;

@@ -1,6 +1,6 @@
-//! Where cameras, matches, masks and features come from: a table per kind, an entry per source. The
-//! options of the command line with their help, the choices that errors name, `auto`, `splatvk
-//! doctor`, run.json and the C interface read them.
+//! Sources of cameras, matches, masks and features: a table per kind, an entry per source. Readers
+//! are the options of the command line with their help, the choices in errors, `auto`, `splatvk
+//! doctor`, run.json and the C interface.
 mod depth;
 mod features;
 mod geometry;
@@ -23,7 +23,7 @@ pub use texts::{DIR_SPACE, dir_encoder};
 use crate::infer::installed::Inventory;
 use table::listed;
 
-/// A line per kind.
+/// One line per kind of source for `splatvk doctor`.
 pub fn list(networks: &Inventory) -> Vec<(String, String)> {
     vec![
         listed::<GeometrySources>(networks),
@@ -39,7 +39,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_table_can_be_read_by_people_and_programs() {
+    fn source_tables_parse_and_serialise() {
         let none = Inventory::default();
         fn of<K: SourceKind>(none: &Inventory) {
             let mut names: Vec<&str> = K::SOURCES.iter().map(|s| s.name).collect();
@@ -50,11 +50,11 @@ mod tests {
                 let chosen = choose::<K>(&text, none).unwrap();
                 assert_eq!(chosen.to_string(), text);
                 assert_eq!(serde_json::to_value(&chosen).unwrap(), text);
-                // With what it should not have, or without what it should.
+                // With a superfluous argument, or without a required one.
                 let wrong =
                     source.argument.map_or(format!("{}:src", source.name), |_| source.name.to_owned());
-                let said = choose::<K>(&wrong, none).unwrap_err().to_string();
-                assert!(said.contains("use one of: auto, ") && said.contains(&source.syntax()), "{said}");
+                let error = choose::<K>(&wrong, none).unwrap_err().to_string();
+                assert!(error.contains("use one of: auto, ") && error.contains(&source.syntax()), "{error}");
             }
             names.sort_unstable();
             names.dedup();

@@ -1,4 +1,4 @@
-//! What a table of sources is, and everything that is read off it.
+//! Tables of sources, and their lookup.
 use crate::infer::installed::{Installed, Inventory, Task, catalogue};
 use crate::infer::{PackFileKind, Registry};
 use crate::language::sam::SamOptions;
@@ -14,19 +14,19 @@ use std::path::{Path, PathBuf};
 /// A source as users write it: `NAME`, or `NAME:ARGUMENT`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SourceChoice {
-    /// Of an entry of the table, or of an installed network or a family of them.
+    /// Name of an entry of the table, or of an installed network or its family.
     pub name: String,
     /// The file or folder, for entries that take one.
     pub argument: Option<PathBuf>,
 }
 
 impl SourceChoice {
-    /// One that takes no argument.
+    /// Choice without argument.
     pub fn named(name: &str) -> SourceChoice {
         SourceChoice { name: name.to_owned(), argument: None }
     }
 
-    /// One with its file or folder.
+    /// Choice with its file or folder.
     pub fn with(name: &str, argument: impl Into<PathBuf>) -> SourceChoice {
         SourceChoice { name: name.to_owned(), argument: Some(argument.into()) }
     }
@@ -66,47 +66,46 @@ impl serde::Serialize for SourceChoice {
     }
 }
 
-/// A kind of thing that has several sources: a command-line option, and the table behind it.
+/// A kind of data with several sources: a command-line option, and the table behind it.
 pub trait SourceKind: 'static {
     /// Name of the option, without dashes.
     const OPTION: &'static str;
-    /// What the option chooses.
+    /// Subject of the option, for `--help`.
     const ABOUT: &'static str;
-    /// What a network must do to be a source of it.
+    /// Task of a network that can be a source.
     const TASK: Task;
-    /// The sources that need no network of the user's; `auto` takes the first where none is
-    /// installed.
+    /// Sources that need no network of the user; `auto` takes the first if none is installed.
     const SOURCES: &'static [Source<Self>];
-    /// What a source is given.
+    /// Input of a source.
     type Input<'i>;
-    /// What it makes: a loaded model, or stages that are added to the graph.
+    /// Output of a source: a loaded model, or stages that are added to the graph.
     type Output;
-    /// Makes it with an installed network.
+    /// Makes the output with an installed network.
     fn network(model: Installed, input: Self::Input<'_>) -> Result<Self::Output>;
 }
 
 /// An entry of a table.
 pub struct Source<K: SourceKind + ?Sized> {
-    /// As users write it.
+    /// Name on the command line.
     pub name: &'static str,
-    /// What follows the name and a colon, for `--help`; `None` for a source without argument.
+    /// Placeholder of the argument for `--help`; `None` for a source without argument.
     pub argument: Option<&'static str>,
-    /// What is not clear from the name; may be empty.
+    /// Explanation beside the name; may be empty.
     pub about: &'static str,
-    /// Models of the default pack.
+    /// Required models of the default pack.
     pub needs: &'static [PackFileKind],
-    /// Refuses, before any work, what would be refused later.
+    /// Validates the argument before any work.
     pub check: fn(&Path, &Given) -> Result<()>,
-    /// Makes it; the path is the argument.
+    /// Makes the output; the path is the argument.
     pub make: fn(&Path, K::Input<'_>) -> Result<K::Output>,
 }
 
-/// For sources of which nothing can be refused before they work.
+/// Check of sources that have nothing to validate.
 pub(super) const NO_CHECK: fn(&Path, &Given) -> Result<()> = |_, _| Ok(());
 
-/// What a source may look at before any work.
+/// Data for checks before any work.
 pub struct Given<'a> {
-    /// As they were read.
+    /// Photos of the run.
     pub photos: &'a [Photo],
     /// The chosen source of masks.
     pub masks: &'a SourceChoice,
@@ -114,21 +113,21 @@ pub struct Given<'a> {
     pub features: &'a SourceChoice,
 }
 
-/// What sources that are stages add them to.
+/// A graph that sources add their stages to.
 pub struct GraphBuilder {
     /// The stages so far.
     pub graph: Graph<'static>,
-    /// Where models are found.
+    /// Installed models.
     pub registry: Registry,
     /// Prompts of a mask network.
     pub sam: SamOptions,
     /// Whether features are read with the masks.
     pub given_features: bool,
-    /// Depth priors, where stereo finds depth.
+    /// Source of depth priors for stereo.
     pub depth_prior: SourceChoice,
-    /// Time against quality.
+    /// Trade-off of time and quality.
     pub preset: Preset,
-    /// Of everything random in cameras and depth.
+    /// Seed of cameras and depth.
     pub seed: u64,
 }
 
@@ -169,14 +168,14 @@ pub fn installed<K: SourceKind>(choice: &SourceChoice, registry: &Registry) -> R
     }
 }
 
-/// Refuses, before any work, what the chosen source would refuse later.
+/// Validates the chosen source before any work.
 pub fn check<K: SourceKind>(choice: &SourceChoice, given: &Given, registry: &Registry) -> Result<()> {
     let Some(source) = built_in::<K>(choice) else { return Ok(()) };
     source.needs.iter().try_for_each(|role| registry.path(*role).map(drop))?;
     (source.check)(choice.path(), given)
 }
 
-/// Makes what the chosen source gives.
+/// Makes the output of the chosen source.
 pub fn make<K: SourceKind>(
     choice: &SourceChoice,
     registry: &Registry,
@@ -188,13 +187,13 @@ pub fn make<K: SourceKind>(
     }
 }
 
-/// The choice of users who make none and have no network: the first of the table.
+/// Choice without an option and without a network: the first of the table.
 pub fn default<K: SourceKind>() -> SourceChoice {
     K::SOURCES.first().map_or_else(|| SourceChoice::named(""), |s| SourceChoice::named(s.name))
 }
 
-/// What a text means: `auto`, an entry of the table, or the name of a network or of a family of
-/// them, whether installed or not. Files and folders must exist.
+/// Parses a choice: `auto`, an entry of the table, or the name or family of a network of the
+/// catalogue, installed or not. Files and folders must exist.
 pub fn choose<K: SourceKind>(text: &str, networks: &Inventory) -> Result<SourceChoice> {
     if text == "auto" {
         let best = networks.best(K::TASK).map(|model| SourceChoice::named(&model.name));
@@ -202,7 +201,7 @@ pub fn choose<K: SourceKind>(text: &str, networks: &Inventory) -> Result<SourceC
     }
     let (name, argument) = text.split_once(':').map_or((text, None), |(name, path)| (name, Some(path)));
     let source = K::SOURCES.iter().find(|s| s.name == name);
-    let network = || catalogue().iter().any(|k| k.does(K::TASK) && (k.family == name || k.id == name));
+    let is_network = || catalogue().iter().any(|k| k.does(K::TASK) && (k.family == name || k.id == name));
     match (source.map(|s| s.argument), argument) {
         (Some(None), None) => Ok(SourceChoice::named(name)),
         (Some(Some(_)), Some(path)) if !path.is_empty() && Path::new(path).exists() => {
@@ -211,7 +210,7 @@ pub fn choose<K: SourceKind>(text: &str, networks: &Inventory) -> Result<SourceC
         (Some(Some(_)), Some(path)) if !path.is_empty() => {
             Err(Error::input(format!("--{}: {path} does not exist; check the path", K::OPTION)))
         }
-        (None, None) if network() => Ok(SourceChoice::named(name)),
+        (None, None) if is_network() => Ok(SourceChoice::named(name)),
         _ => {
             let own = K::SOURCES.iter().map(Source::syntax);
             let choices: Vec<String> = std::iter::once("auto".to_owned()).chain(own).collect();
@@ -223,7 +222,7 @@ pub fn choose<K: SourceKind>(text: &str, networks: &Inventory) -> Result<SourceC
     }
 }
 
-/// The help of the option.
+/// Help text of the option.
 pub fn help<K: SourceKind>() -> String {
     let first = K::SOURCES.first().map_or("", |s| s.name);
     let own = K::SOURCES.iter().map(|s| match s.about {
@@ -238,8 +237,7 @@ pub fn help<K: SourceKind>() -> String {
     )
 }
 
-/// One line about an option for `splatvk doctor`: (option, what `auto` takes and what else there
-/// is).
+/// Line of an option for `splatvk doctor`: (option, choice of `auto` and all choices).
 pub(super) fn listed<K: SourceKind>(networks: &Inventory) -> (String, String) {
     let auto = networks.best(K::TASK).map_or(K::SOURCES.first().map_or("", |s| s.name), |m| &m.name);
     let own = K::SOURCES.iter().map(Source::syntax);
@@ -259,7 +257,7 @@ fn families(task: Task) -> Vec<&'static str> {
 }
 
 impl<K: SourceKind> Source<K> {
-    /// As users write it, with what stands for the argument.
+    /// Name with the placeholder of the argument.
     pub fn syntax(&self) -> String {
         self.argument.map_or_else(|| self.name.to_owned(), |argument| format!("{}:{argument}", self.name))
     }

@@ -1,5 +1,5 @@
-//! Embeddings of texts for precomputed features: a table of phrases first, then a network whose
-//! texts are as long.
+//! Embeddings of texts for precomputed features: a table of phrases first, then a network with
+//! embeddings of the same length.
 use crate::infer::clip::Clip;
 use crate::infer::contract::Part;
 use crate::infer::installed::{Installed, Task, inventory};
@@ -15,18 +15,19 @@ use std::path::Path;
 /// Space name of precomputed features.
 pub const DIR_SPACE: &str = "dir";
 
-/// Phrases of the table that a network must embed alike.
+/// Phrases of the table that a network must embed equally.
 const PROBES: usize = 4;
-/// Least cosine between its embedding of a phrase and the table's. Tables may word a phrase as "a
-/// photo of …", which leaves it at 0.8 and more; directions of another space are at 0 ± 1/√D.
+/// Minimum cosine between the network's embedding of a phrase and the table's. Tables may word a
+/// phrase as "a photo of …", which leaves it at 0.8 and more; directions of another space are at 0
+/// ± 1/√D.
 const SAME_SPACE: f64 = 0.5;
 
 fn cosine(a: &[f32], b: &[f32]) -> f64 {
     a.iter().zip(b).map(|(a, b)| f64::from(a * b)).sum()
 }
 
-/// What embeds texts for the features of a `dir:` folder whose table is `path`, if it has one;
-/// `dim` is the length of the features, where that is known.
+/// Text encoder for the features of a `dir:` folder with the table `path`, if it exists; `dim` is
+/// the length of the features, if table_rows.
 pub fn dir_encoder(path: &Path, dim: Option<usize>, registry: &Registry) -> Result<Box<dyn RegionEncoder>> {
     let mut texts = TextEmbeddings::default();
     match dim {
@@ -34,37 +35,37 @@ pub fn dir_encoder(path: &Path, dim: Option<usize>, registry: &Registry) -> Resu
         _ => texts = TextEmbeddings::read(path)?,
     }
     let registry = registry.clone();
-    Ok(Box::new(DirTexts { texts, registry, tower: None }))
+    Ok(Box::new(DirTexts { texts, registry, text_network: None }))
 }
 
-/// Texts behind the encoder boundary; region features were read with the masks.
+/// Text encoder of precomputed features; region features were read with the masks.
 struct DirTexts {
     texts: TextEmbeddings,
     registry: Registry,
-    /// Loaded for the first text that the table does not have.
-    tower: Option<Tower>,
+    /// Network for texts outside the table, loaded on first use.
+    text_network: Option<TextNetwork>,
 }
 
-struct Tower {
+struct TextNetwork {
     name: String,
-    network: Clip,
-    /// Whether phrases of the table have shown that its space is that of the features.
-    proven: bool,
+    encoder: Clip,
+    /// Whether phrases of the table confirmed the space of the features.
+    confirmed: bool,
 }
 
 impl DirTexts {
-    /// [N, D] rows of those texts that the table has.
-    fn known(&self, texts: &[String]) -> Vec<f32> {
+    /// [N, D] embeddings of those texts that the table has.
+    fn table_rows(&self, texts: &[String]) -> Vec<f32> {
         texts.iter().filter_map(|text| self.texts.get(text)).flatten().copied().collect()
     }
 
-    /// The first installed network of the table's space; `text` is what it is for.
-    fn tower(&mut self, text: &str) -> Result<&mut Tower> {
-        if self.tower.is_none() {
-            let found = self.find()?;
-            self.tower = Some(found.ok_or_else(|| {
-                let known: Vec<&str> = self.texts.iter().map(|(phrase, _)| phrase).take(20).collect();
-                let table = if known.is_empty() { "nothing".to_owned() } else { known.join(", ") };
+    /// The first installed network of the table's space; `text` is named in the error.
+    fn text_network(&mut self, text: &str) -> Result<&mut TextNetwork> {
+        if self.text_network.is_none() {
+            let found = self.find_network()?;
+            self.text_network = Some(found.ok_or_else(|| {
+                let phrases: Vec<&str> = self.texts.iter().map(|(phrase, _)| phrase).take(20).collect();
+                let table = if phrases.is_empty() { "nothing".to_owned() } else { phrases.join(", ") };
                 Error::missing(format!(
                     "no text embedding for '{text}': text_embeddings.npz has {table}, and no installed text model has embeddings \
                      of {} values in its space; add the phrase to the table, or install the model that made the features",
@@ -72,29 +73,33 @@ impl DirTexts {
                 ))
             })?);
         }
-        self.tower.as_mut().ok_or_else(|| Error::work("the text model is gone"))
+        self.text_network.as_mut().ok_or_else(|| Error::work("the text model is gone"))
     }
 
-    fn find(&self) -> Result<Option<Tower>> {
-        let length = |m: &Installed| m.graph(Part::TextTower).ok()?.fixed("embedding", "D");
-        let fits = |m: &Installed| length(m).is_none_or(|d| d == self.texts.dim);
+    fn find_network(&self) -> Result<Option<TextNetwork>> {
+        let fits = |m: &Installed| text_dim(m).is_none_or(|d| d == self.texts.dim);
         let models = inventory(&self.registry).models;
         for model in models.into_iter().filter(|m| m.tasks.contains(&Task::Text) && fits(m)) {
             let name = model.name.clone();
-            let mut network = Clip::load(model)?;
-            if network.dim() != self.texts.dim {
+            let mut encoder = Clip::load(model)?;
+            if encoder.dim() != self.texts.dim {
                 continue;
             }
             let probes: Vec<(&str, &[f32])> = self.texts.iter().take(PROBES).collect();
             let phrases: Vec<&str> = probes.iter().map(|p| p.0).collect();
-            let rows = network.embed_texts(&phrases)?;
+            let rows = encoder.embed_texts(&phrases)?;
             let alike = |(row, probe): (&[f32], &(&str, &[f32]))| cosine(row, probe.1) >= SAME_SPACE;
             if rows.chunks_exact(self.texts.dim.max(1)).zip(&probes).all(alike) {
-                return Ok(Some(Tower { name, network, proven: !probes.is_empty() }));
+                return Ok(Some(TextNetwork { name, encoder, confirmed: !probes.is_empty() }));
             }
         }
         Ok(None)
     }
+}
+
+/// Fixed length of a model's text embeddings, if it has one.
+fn text_dim(model: &Installed) -> Option<usize> {
+    model.graph(Part::TextTower).ok()?.fixed("embedding", "D")
 }
 
 impl RegionEncoder for DirTexts {
@@ -118,7 +123,7 @@ impl RegionEncoder for DirTexts {
         for text in texts {
             match self.texts.get(text) {
                 Some(row) => rows.extend_from_slice(row),
-                None => rows.extend(self.tower(text)?.network.embed_texts(&[text])?),
+                None => rows.extend(self.text_network(text)?.encoder.embed_texts(&[text])?),
             }
         }
         Ok(rows)
@@ -127,16 +132,18 @@ impl RegionEncoder for DirTexts {
         self.texts.get(text).is_some()
     }
     fn embed_other_things(&mut self, form: &str) -> Result<Vec<f32>> {
-        let rows = self.known(&things::of_form(form));
-        match &mut self.tower {
-            Some(tower) if rows.len() < MIN_OTHERS * self.texts.dim => tower.network.embed_other_things(form),
+        let rows = self.table_rows(&things::of_form(form));
+        match &mut self.text_network {
+            Some(network) if rows.len() < MIN_OTHERS * self.texts.dim => {
+                network.encoder.embed_other_things(form)
+            }
             _ => Ok(rows),
         }
     }
     fn embed_recoloured(&mut self, text: &str) -> Result<Vec<f32>> {
-        match &mut self.tower {
-            Some(tower) => tower.network.embed_recoloured(text),
-            None => Ok(self.known(&things::recoloured(text))),
+        match &mut self.text_network {
+            Some(network) => network.encoder.embed_recoloured(text),
+            None => Ok(self.table_rows(&things::recoloured(text))),
         }
     }
     fn name_regions(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
@@ -149,15 +156,15 @@ impl RegionEncoder for DirTexts {
     fn embedding_source(&self, text: &str) -> Option<String> {
         match self.texts.get(text) {
             Some(_) => Some("text_embeddings.npz".to_owned()),
-            None => self.tower.as_ref().map(|t| t.name.clone()),
+            None => self.text_network.as_ref().map(|t| t.name.clone()),
         }
     }
     fn embedding_warning(&self) -> Option<String> {
-        let tower = self.tower.as_ref().filter(|t| !t.proven)?;
+        let network = self.text_network.as_ref().filter(|t| !t.confirmed)?;
         Some(format!(
             "texts are embedded by {}, since it gives {} values as the features have: whether it is their space cannot be known \
              without phrases in text_embeddings.npz",
-            tower.name, self.texts.dim
+            network.name, self.texts.dim
         ))
     }
 }
@@ -173,14 +180,14 @@ mod tests {
     }
 
     #[test]
-    fn the_table_answers_first_and_then_a_network_of_its_space() {
+    fn texts_prefer_table_over_network() {
         let folder = tempfile::tempdir().unwrap();
         clip_in(folder.path(), [0, 1, 2]);
         let table = |row: Vec<f32>| {
             let row = NpyArray::f32(&[3], row);
             write_npz(folder.path().join("text_embeddings.npz"), &[("Blue", &row)]).unwrap();
         };
-        // Without a table the length is all that is known.
+        // Without a table only the length is table_rows.
         let mut towers = encoder(folder.path(), Some(3));
         let blue = towers.embed_texts(&["blue"]).unwrap();
         assert_eq!(towers.embedding_source("blue").as_deref(), Some("clip_toy"));

@@ -18,14 +18,14 @@ use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-/// Places new photos in a scene by matches with its photos; training moves their cameras on against
-/// its splats.
+/// Registers new photos in a scene by matches with its photos; training then refines their cameras
+/// against its splats.
 pub struct AddedCameras {
     /// The scene.
     pub base: Arc<BaseScene>,
-    /// As they were read.
+    /// New photos.
     pub photos: Vec<Photo>,
-    /// Of the samples of RANSAC.
+    /// Seed of the RANSAC samples.
     pub seed: u64,
 }
 
@@ -56,19 +56,19 @@ impl Stage for AddedCameras {
     }
 }
 
-/// Depth of all photos and the points that the new ones add: stereo for the new photos and their
-/// neighbours, what the scene renders for the others.
+/// Depth of all photos and points that the new ones add: stereo for the new photos and their
+/// neighbours, rendered depth for the others.
 pub struct AddedDepth {
     /// The scene.
     pub base: Arc<BaseScene>,
-    /// Time against quality.
+    /// Trade-off of time and quality.
     pub preset: Preset,
-    /// Of the planes that stereo tries.
+    /// Seed of the planes that stereo tries.
     pub seed: u64,
 }
 
-/// Photos of the scene that the depth of a new one is matched with: with itself four, the number
-/// that stereo was tuned on. Each takes as long as the new photo.
+/// Photos of the scene that stereo matches with a new one. Together they are four, the number that
+/// stereo was tuned on. Each takes as long as the new photo.
 const NEIGHBOURS: usize = 3;
 
 impl Stage for AddedDepth {
@@ -96,8 +96,8 @@ impl Stage for AddedDepth {
             model.cameras.iter().map(|c| Ok(renderer.render(c)?.depth)).collect::<Result<_>>()?;
 
         let views = with_neighbours(model, count, all);
-        let pick = |v: &usize| (placed.photos[*v].clone(), model.cameras[*v].clone());
-        let (photos, cameras): (Vec<Photo>, Vec<Camera>) = views.iter().map(pick).unzip();
+        let (photos, cameras): (Vec<Photo>, Vec<Camera>) =
+            views.iter().map(|v| (placed.photos[*v].clone(), model.cameras[*v].clone())).unzip();
         let sparse = SparseModel { cameras, points: model.points.clone(), ..SparseModel::default() };
         let options = StereoOptions::preset(self.preset).seeded(self.seed);
         let priors: Vec<_> = photos.iter().map(|_| None).collect();
@@ -129,8 +129,8 @@ impl Stage for AddedDepth {
     }
 }
 
-/// The splats of a scene that its photos show, no more than `most`: what it guessed where none
-/// looks is guessed anew with the new ones.
+/// The splats of a scene that its photos show, at most `most`. Its unseen surfaces are left out;
+/// training extrapolates them again with the new photos.
 fn shown_splats(base: &BaseScene, most: usize, context: &Context) -> Result<Splats> {
     let rows = if base.seen.pixels.is_empty() {
         let seen = view::seen(context.device, &base.splats, &base.known.cameras, context.progress)?;
@@ -141,7 +141,7 @@ fn shown_splats(base: &BaseScene, most: usize, context: &Context) -> Result<Spla
     Ok(base.splats.picked(&rows))
 }
 
-/// New views and, of the others, those that share most points with each of them; ascending.
+/// New views, and for each the known views that share most points with it; ascending.
 fn with_neighbours(model: &SparseModel, known: usize, all: usize) -> Vec<usize> {
     let mut views: BTreeSet<usize> = (known..all).collect();
     for new in known..all {
@@ -156,7 +156,8 @@ fn with_neighbours(model: &SparseModel, known: usize, all: usize) -> Vec<usize> 
     views.into_iter().collect()
 }
 
-/// Depth as the scene renders it, as sure as where several photos agreed on it: they trained it.
+/// Rendered depth with the confidence of depth on which several photos agree: such depth trained
+/// it.
 fn trusted(depth: &Image<f32>) -> DepthMap {
     let confidence = depth.data.iter().map(|z| if *z > 0.0 { 0.9 } else { 0.0 }).collect();
     DepthMap {
@@ -165,11 +166,11 @@ fn trusted(depth: &Image<f32>) -> DepthMap {
     }
 }
 
-/// Trains a scene on with all photos.
+/// Continues training of a scene with all photos.
 pub struct TrainOn {
     /// The scene.
     pub base: Arc<BaseScene>,
-    /// How.
+    /// Options of the training.
     pub options: RgbOptions,
 }
 
@@ -191,7 +192,7 @@ impl Stage for TrainOn {
         let (count, all) = (self.base.known.photos.len(), placed.photos.len());
         let most = self.options.init.max_points;
         let options = self.options.for_continuation(count, all - count);
-        // As many splats on surfaces in the end as a run with all photos has.
+        // The final number of splats on surfaces is that of a run with all photos.
         let fresh = geometry.points.len().min(options.init.max_points);
         let scene = shown_splats(&self.base, most - fresh, context)?;
         let (targets, coverage) = shared::targets(&placed.photos);
@@ -206,9 +207,9 @@ impl Stage for TrainOn {
     }
 }
 
-/// The new photos alone, for what the scene has of its own already.
+/// The new photos alone, for stages that the scene's own photos have passed.
 pub struct OnlyAdded {
-    /// Photos of the scene.
+    /// Number of photos of the scene.
     pub known: usize,
 }
 
@@ -227,9 +228,9 @@ impl Stage for OnlyAdded {
     }
 }
 
-/// [`OnlyAdded`] for cameras and depth.
+/// Cameras and depth of the new photos alone.
 pub struct OnlyAddedGeometry {
-    /// Photos of the scene.
+    /// Number of photos of the scene.
     pub known: usize,
 }
 
@@ -252,8 +253,8 @@ impl Stage for OnlyAddedGeometry {
     }
 }
 
-/// Brings the masks of new photos under the codes of the scene; what matches none of its things
-/// gets a code of its own.
+/// Assigns the codes of the scene to the masks of new photos; masks that match none of its things
+/// get codes of their own.
 pub struct AlignAdded {
     /// The scene.
     pub base: Arc<BaseScene>,
@@ -282,7 +283,7 @@ impl Stage for AlignAdded {
     ) -> Result<Language> {
         let (base, count) = (&self.base, self.base.known.photos.len());
         let mut viewer = Viewer::new(context.device, &base.splats, &base.field)?;
-        // What the scene says of its own photos is what they go on to teach.
+        // The scene's own photos keep training on the codes that the scene shows.
         let known = base.known.cameras.iter().map(|c| viewer.codes(c)).collect::<Result<Vec<_>>>()?;
         let new = trained.cameras[count..].iter().zip(&geometry.depths[count..]);
         let new = new

@@ -1,4 +1,4 @@
-//! The finished scene seen from the photos' cameras, and the answers to the queries.
+//! Views of the finished scene from the photos' cameras, and answers to the queries.
 use crate::Result;
 use crate::fit::{Trained, TrainedLanguage};
 use crate::pipeline::{Context, Lane, Output, Stage};
@@ -32,7 +32,7 @@ impl Stage for DecodeViews {
 
 /// Answers the queries.
 pub struct AnswerQueries {
-    /// How.
+    /// Options of the answers.
     pub options: QueryOptions,
 }
 
@@ -64,7 +64,7 @@ impl Stage for AnswerQueries {
             for note in query.reading.notes() {
                 context.progress.warn(&format!("“{}”: {note}", query.text));
             }
-            // Texts of one form share their other things.
+            // Texts of one form share their alternatives.
             let background = backgrounds.entry(Arc::as_ptr(&query.alternatives.things)).or_insert(None);
             prepared.answer(&language.field, (&trained.cameras, frames), query, &self.options, background)
         };

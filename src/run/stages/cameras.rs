@@ -16,41 +16,41 @@ use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-/// Where cameras come from.
+/// Source of cameras.
 pub enum CameraOrigin {
     /// Structure from motion.
     Sfm,
-    /// Known ones, joined to the photos by name.
+    /// Known cameras, joined to the photos by name.
     Known(CameraFile),
-    /// Pointmaps of a network, with depth; structure from motion where an untrained one gives no
+    /// Pointmaps and depth of a network; structure from motion if an untrained network gives no
     /// geometry.
     Network(Installed),
-    /// Cameras and points that were given.
+    /// Given cameras and points.
     GivenGeometry(Geometry),
 }
 
-/// Photos as all later stages take them, without lens distortion and in one light, and what is
-/// known of their cameras.
+/// Photos without lens distortion and in one light, as all later stages take them, with the
+/// geometry known so far.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct PlacedPhotos {
-    /// The photos that have a camera.
+    /// Registered photos.
     pub photos: Vec<Photo>,
-    /// Those whose place could not be found surely.
+    /// Photos that could not be registered reliably.
     pub left_out: Vec<LeftOut>,
-    /// How far geometry is known.
+    /// Geometry known so far.
     pub known: KnownGeometry,
 }
 
-/// Geometry that the first stage leaves to the later ones.
+/// Geometry that the first stage passes on.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub enum KnownGeometry {
-    /// Cameras and sparse points, and how they were found; depth is still to come.
+    /// Cameras and sparse points, and the method that found them; without depth.
     Sparse(SparseModel, String),
-    /// Depth and points too, from a network or given.
+    /// Cameras, depth and points, from a network or given.
     Complete(Geometry),
 }
 
-/// Finds cameras and places photos.
+/// Finds cameras and registers photos.
 pub struct Cameras {
     photos: Vec<Photo>,
     source: CameraOrigin,
@@ -59,23 +59,23 @@ pub struct Cameras {
 }
 
 impl Cameras {
-    /// Of these photos; `seed` draws the samples of RANSAC.
+    /// Prepares the stage for `photos`; `seed` draws the samples of RANSAC.
     pub fn new(photos: Vec<Photo>, source: CameraOrigin, seed: u64) -> Result<Cameras> {
-        let source_name = match &source {
+        let source_identity = match &source {
             CameraOrigin::Sfm => "sfm".to_owned(),
             CameraOrigin::Known(file) => format!("{file:?}"),
             CameraOrigin::Network(model) => shared::identity(model)?,
             CameraOrigin::GivenGeometry(geometry) => format!("{geometry:?}"),
         };
-        let photos_name: Vec<String> = photos.iter().map(identity).collect();
-        // Nothing is drawn where cameras are given: runs that differ in the seed alone share them.
-        let drawn = matches!(source, CameraOrigin::Sfm | CameraOrigin::Network(_)).then_some(seed);
-        let settings = format!("{source_name} {photos_name:?} {drawn:?}");
+        let photo_identities: Vec<String> = photos.iter().map(identity).collect();
+        // Given cameras use no seed: runs that differ in the seed alone share this stage.
+        let used_seed = matches!(source, CameraOrigin::Sfm | CameraOrigin::Network(_)).then_some(seed);
+        let settings = format!("{source_identity} {photo_identities:?} {used_seed:?}");
         Ok(Cameras { photos, source, seed, settings })
     }
 }
 
-/// Everything of a photo that stages read.
+/// Text that identifies everything that stages read of a photo.
 pub(super) fn identity(photo: &Photo) -> String {
     let mut digest = Sha256::new();
     digest.update(bytemuck::cast_slice::<_, u8>(&photo.image.data));
@@ -116,7 +116,7 @@ impl Stage for Cameras {
             CameraOrigin::Network(model) => {
                 let maps = pairs::pointmaps(model, &photos, progress)?;
                 match pointmap::reconstruct(maps, self.seed, progress) {
-                    Ok(found) => return Ok(of_network(&model.name, photos, found)),
+                    Ok(found) => return Ok(network_photos(&model.name, photos, found)),
                     Err(Error::Cancelled) => return Err(Error::Cancelled),
                     Err(error) if model.untrained() => progress.warn(&format!(
                         "{}: no geometry in untrained pointmaps ({error}); cameras from sfm",
@@ -142,8 +142,8 @@ impl Stage for Cameras {
     }
 }
 
-/// The photos that a network's geometry places.
-fn of_network(model: &str, photos: Vec<Photo>, found: pointmap::Reconstruction) -> PlacedPhotos {
+/// Photos that a network's geometry registers.
+fn network_photos(model: &str, photos: Vec<Photo>, found: pointmap::Reconstruction) -> PlacedPhotos {
     let mut left_out = Vec::new();
     let mut kept = Vec::new();
     for (view, photo) in photos.into_iter().enumerate() {
@@ -159,30 +159,35 @@ fn of_network(model: &str, photos: Vec<Photo>, found: pointmap::Reconstruction) 
     PlacedPhotos { photos: kept, left_out, known }
 }
 
-/// Depth and points on the pixels that the photos use.
+/// Removes depth and points of pixels that the photos do not use.
 fn without_unused(mut geometry: Geometry, photos: &[Photo]) -> Geometry {
     for (depth, photo) in geometry.depths.iter_mut().zip(photos).filter(|(_, p)| p.coverage.is_some()) {
         depth.keep(|i| photo.uses(i));
     }
-    let points = &geometry.points;
-    let is_used = |i: &usize| {
-        let view = usize::from(points.view[*i]);
-        let (Some(photo), Some(camera)) = (photos.get(view), geometry.cameras.get(view)) else { return true };
-        let (pixel, _) = camera.project(glam::DVec3::from(points.positions[*i].map(f64::from)));
-        let (w, h) = (photo.image.width, photo.image.height);
-        let inside = |v: f64, size: usize| (v.max(0.0) as usize).min(size - 1);
-        photo.uses(inside(pixel.y, h) * w + inside(pixel.x, w))
-    };
-    let rows: Vec<usize> = (0..points.len()).filter(is_used).collect();
-    geometry.points = points.picked(&rows);
+    let rows: Vec<usize> =
+        (0..geometry.points.len()).filter(|&i| is_used_point(&geometry, photos, i)).collect();
+    geometry.points = geometry.points.picked(&rows);
     geometry
 }
 
-/// Depth maps and points by stereo, where no network has given them.
+/// Whether a point projects to a used pixel of its photo.
+fn is_used_point(geometry: &Geometry, photos: &[Photo], point: usize) -> bool {
+    let view = usize::from(geometry.points.view[point]);
+    let (Some(photo), Some(camera)) = (photos.get(view), geometry.cameras.get(view)) else { return true };
+    let (pixel, _) = camera.project(glam::DVec3::from(geometry.points.positions[point].map(f64::from)));
+    let (w, h) = (photo.image.width, photo.image.height);
+    photo.uses(pixel_index(pixel.y, h) * w + pixel_index(pixel.x, w))
+}
+
+fn pixel_index(position: f64, size: usize) -> usize {
+    (position.max(0.0) as usize).min(size - 1)
+}
+
+/// Depth maps and points by stereo, unless a network has given them.
 pub struct DenseDepth {
-    /// Time against quality.
+    /// Trade-off of time and quality.
     pub preset: Preset,
-    /// Of the planes that stereo tries.
+    /// Seed of the planes that stereo tries.
     pub seed: u64,
 }
 
@@ -216,7 +221,7 @@ impl Stage for DenseDepth {
     }
 }
 
-/// Which way is up.
+/// The direction up.
 pub struct Upright;
 
 impl Stage for Upright {

@@ -1,4 +1,4 @@
-//! Masks → aligned things with codes → splats that carry them; and embeddings of texts.
+//! Masks → aligned things with codes → splats that carry them; embeddings of texts.
 use super::cameras::PlacedPhotos;
 use super::shared;
 use crate::fit::{LanguageOptions, Trained, TrainedLanguage};
@@ -15,7 +15,7 @@ use crate::sync::lock;
 use crate::{Error, Result};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// An encoder that several stages use, one at a time.
+/// An encoder that several stages share, one at a time.
 #[derive(Clone)]
 pub struct SharedEncoder {
     encoder: Arc<Mutex<Box<dyn RegionEncoder>>>,
@@ -24,7 +24,7 @@ pub struct SharedEncoder {
 }
 
 impl SharedEncoder {
-    /// `identity` names the models behind it, with checksums.
+    /// Wraps an encoder; `identity` names its models with their checksums.
     pub fn new(encoder: Box<dyn RegionEncoder>, identity: String) -> SharedEncoder {
         let space = encoder.space().to_owned();
         SharedEncoder {
@@ -39,26 +39,26 @@ impl SharedEncoder {
         &self.space
     }
 
-    /// The encoder itself, once nothing else shares it.
+    /// The encoder itself, if nothing else shares it.
     pub fn into_inner(self) -> Result<Box<dyn RegionEncoder>> {
         let alone = Arc::into_inner(self.encoder).ok_or_else(|| Error::work("the encoder is in use"))?;
         Ok(alone.into_inner().unwrap_or_else(PoisonError::into_inner))
     }
 
-    /// The models behind it.
+    /// Identity of its models.
     pub fn identity(&self) -> &str {
         &self.identity
     }
 
-    /// Asks it.
-    pub fn with<T>(&self, ask: impl FnOnce(&mut dyn RegionEncoder) -> T) -> T {
-        ask(lock(&self.encoder).as_mut())
+    /// Runs `call` with exclusive access to the encoder.
+    pub fn with<T>(&self, call: impl FnOnce(&mut dyn RegionEncoder) -> T) -> T {
+        call(lock(&self.encoder).as_mut())
     }
 }
 
-/// Embeds the questions.
+/// Embeds the texts of the queries.
 pub struct EmbedQueries {
-    /// By whom.
+    /// Text encoder.
     pub encoder: SharedEncoder,
     /// Texts of the queries.
     pub texts: Vec<String>,
@@ -88,7 +88,7 @@ impl Stage for EmbedQueries {
     }
 }
 
-/// Aligns masks across photos and gives every thing a code.
+/// Aligns masks across photos and assigns a code to every thing.
 pub struct Align {
     /// The method.
     pub recipe: Recipe,
@@ -122,9 +122,9 @@ impl Stage for Align {
     }
 }
 
-/// The text model's own phrases for every code.
+/// Phrases of the text model for every code.
 pub struct NameCodes {
-    /// Whose.
+    /// Text encoder.
     pub encoder: SharedEncoder,
 }
 
@@ -148,7 +148,7 @@ impl Stage for NameCodes {
 pub struct TrainLanguage {
     /// The method.
     pub recipe: Recipe,
-    /// How.
+    /// Options of the training.
     pub options: LanguageOptions,
 }
 

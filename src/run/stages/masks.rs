@@ -47,7 +47,7 @@ impl Stage for ContourMaps {
     }
 }
 
-/// The built-in masks, helped by learned edges.
+/// The built-in masks, from graph segmentation with learned edges.
 pub struct GraphMasks;
 
 impl Stage for GraphMasks {
@@ -69,20 +69,20 @@ impl Stage for GraphMasks {
         progress.begin("masks", placed.photos.len() as u64);
         let done = AtomicU64::new(0);
         let options = graph::GraphOptions::default();
-        let one = |(photo, edges): (&Photo, &Image<f32>)| {
+        let segment = |(photo, edges): (&Photo, &Image<f32>)| {
             progress.check()?;
             let masks = graph::segment(&photo.image, edges, &options)?;
             progress.step(done.fetch_add(1, Ordering::Relaxed) + 1, "");
             Ok(masks)
         };
-        let masks = placed.photos.par_iter().zip(edges).map(one).collect::<Result<_>>()?;
+        let masks = placed.photos.par_iter().zip(edges).map(segment).collect::<Result<_>>()?;
         progress.end();
         Ok(masks)
     }
 }
 
-/// A network's masks, or the built-in ones where it gave none: untrained weights rarely give a
-/// stable mask, and the stages after this one need some to work on.
+/// A network's masks, or the built-in ones if it gave none: untrained weights rarely give a stable
+/// mask, and the later stages need some.
 pub struct MasksOrFallback;
 
 impl Stage for MasksOrFallback {
@@ -116,7 +116,7 @@ pub struct NetworkMasks {
 }
 
 impl NetworkMasks {
-    /// The network and its prompts.
+    /// Prepares masks by a network with these prompts.
     pub fn new(model: Installed, options: SamOptions) -> Result<NetworkMasks> {
         let settings = format!("{} {options:?}", shared::identity(&model)?);
         Ok(NetworkMasks { model, options, settings })
@@ -146,7 +146,7 @@ impl Stage for NetworkMasks {
 pub struct GivenMasks {
     /// The folder.
     pub dir: PathBuf,
-    /// Whether features are read, too.
+    /// Whether the folder's features are read as well.
     pub features: bool,
 }
 
@@ -157,7 +157,7 @@ impl Stage for GivenMasks {
     type Output = Vec<ViewMasks>;
 
     fn settings(&self) -> String {
-        // Not kept; what is made of it is, so the files count.
+        // The masks are not stored, but later outputs are, so the files count.
         let sums: Vec<Option<String>> =
             files_in(&self.dir).iter().map(|f| crate::files::content_hash(f).ok()).collect();
         format!("{:?} {} {sums:?}", self.dir, self.features)
@@ -181,9 +181,9 @@ fn files_in(dir: &std::path::Path) -> Vec<PathBuf> {
     files
 }
 
-/// Features of the masks that came without.
+/// Computes features of the masks that have none.
 pub struct RegionFeatures {
-    /// Whose.
+    /// Encoder of the features.
     pub encoder: SharedEncoder,
 }
 
@@ -215,7 +215,7 @@ impl Stage for RegionFeatures {
     }
 }
 
-/// Gives features to the masks that came without.
+/// Computes features of the masks that have none.
 pub fn describe<'i>(
     masks: &mut [ViewMasks],
     images: impl Iterator<Item = &'i RgbImage>,
@@ -233,7 +233,7 @@ pub fn describe<'i>(
                 let maps = if whole.is_empty() { std::slice::from_ref(&level.labels) } else { &whole };
                 for map in maps {
                     let rows = encoder.with(|e| e.embed_regions(image, map, count, progress))?;
-                    // A mask is on one map; on the others its row is zero.
+                    // Each mask is in one map; its row in the others is zero.
                     level.features.resize(rows.len(), 0.0);
                     level.features.iter_mut().zip(rows).for_each(|(sum, v)| *sum += v);
                 }
@@ -253,10 +253,10 @@ mod tests {
     use crate::language::LevelMasks;
     use crate::progress::Silent;
 
-    /// What it says of a region is how many pixels it was shown of it.
-    struct Counter;
+    /// Encodes a region as its number of pixels.
+    struct PixelCounter;
 
-    impl RegionEncoder for Counter {
+    impl RegionEncoder for PixelCounter {
         fn space(&self) -> &str {
             "count"
         }
@@ -271,8 +271,8 @@ mod tests {
             progress: &dyn Progress,
         ) -> Result<Vec<f32>> {
             progress.check()?;
-            let of = |k: usize| labels.data.iter().filter(|l| **l == k as i32).count() as f32;
-            Ok((0..count).map(of).collect())
+            let pixels = |k: usize| labels.data.iter().filter(|l| **l == k as i32).count() as f32;
+            Ok((0..count).map(pixels).collect())
         }
         fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
             Ok(vec![1.0; texts.len()])
@@ -280,7 +280,7 @@ mod tests {
     }
 
     #[test]
-    fn an_encoder_sees_masks_whole_whatever_lies_on_them() {
+    fn describe_embeds_occluded_masks_whole() {
         let image = RgbImage { width: 4, height: 1, data: vec![[0.5; 3]; 4] };
         let map = |data: [i32; 4]| Image { width: 4, height: 1, data: data.to_vec() };
         // Mask 0 is three pixels long, mask 1 lies on two of them.
@@ -292,7 +292,7 @@ mod tests {
         };
         let plain = LevelMasks { whole: Vec::new(), ..level.clone() };
         let mut masks = [ViewMasks { levels: vec![level, plain] }];
-        let encoder = SharedEncoder::new(Box::new(Counter), String::new());
+        let encoder = SharedEncoder::new(Box::new(PixelCounter), String::new());
         describe(&mut masks, [&image].into_iter(), &encoder, &Silent).unwrap();
         assert_eq!(masks[0].levels[0].features, [3.0, 2.0]);
         assert_eq!(masks[0].levels[1].features, [1.0, 2.0]);

@@ -1,4 +1,4 @@
-//! Photos → dense matches between every two of them.
+//! Photos → dense matches between every pair of them.
 use super::cameras::PlacedPhotos;
 use super::shared;
 use crate::Result;
@@ -83,7 +83,7 @@ pub struct NetworkMatches {
 }
 
 impl NetworkMatches {
-    /// The network.
+    /// Prepares the matching by a network.
     pub fn new(model: Installed) -> Result<NetworkMatches> {
         let settings = shared::identity(&model)?;
         Ok(NetworkMatches { model, settings })

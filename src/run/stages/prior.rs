@@ -8,24 +8,24 @@ use crate::scene::DepthPrior;
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 
-/// Where depth priors come from.
+/// Source of depth priors.
 pub enum PriorOrigin {
-    /// There are none.
+    /// No priors.
     None,
-    /// Files.
+    /// Files of a folder.
     Folder(PathBuf),
-    /// A network of one photo's depth, or of geometry.
+    /// A network for monocular depth or for geometry.
     Network(Box<Installed>),
 }
 
-/// The priors of all photos, where stereo is to find their depth.
+/// Depth priors of all photos, if stereo computes their depth.
 pub struct DepthPriors {
     origin: PriorOrigin,
     settings: String,
 }
 
 impl DepthPriors {
-    /// From there.
+    /// Prepares priors from `origin`.
     pub fn new(origin: PriorOrigin) -> Result<DepthPriors> {
         let settings = match &origin {
             PriorOrigin::None => String::new(),

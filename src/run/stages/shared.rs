@@ -1,4 +1,4 @@
-//! What several stages need.
+//! Helpers of several stages.
 use crate::Result;
 use crate::fit::Photos;
 use crate::infer::Registry;
@@ -14,20 +14,21 @@ pub(super) fn images(photos: &[Photo]) -> Vec<RgbImage> {
     photos.iter().map(|p| p.image.clone()).collect()
 }
 
-/// Targets of renders, and their pixels that count; the others continue them, so that no colour of
-/// what hides the scene gets into it.
+/// Targets of renders and their used pixels. The other pixels continue the used ones, so that no
+/// colour of an occluder gets into the target.
 pub(super) fn targets(photos: &[Photo]) -> (Vec<RgbImage>, Vec<Option<Coverage>>) {
-    let target = |p: &Photo| {
-        let mut image = p.target();
-        if p.coverage.as_ref().is_some_and(|c| c.outside == Outside::Unknown) {
-            image.fill_from_used(|i| p.uses(i));
-        }
-        (image, p.coverage.clone())
-    };
     photos.iter().map(target).unzip()
 }
 
-/// What training compares with.
+fn target(photo: &Photo) -> (RgbImage, Option<Coverage>) {
+    let mut image = photo.target();
+    if photo.coverage.as_ref().is_some_and(|c| c.outside == Outside::Unknown) {
+        image.fill_from_used(|i| photo.uses(i));
+    }
+    (image, photo.coverage.clone())
+}
+
+/// Input of training.
 pub(super) fn posed<'a>(
     images: &'a [RgbImage],
     cameras: &'a [Camera],
@@ -37,13 +38,13 @@ pub(super) fn posed<'a>(
     Photos { images, cameras, depths, coverage }
 }
 
-/// What an installed network is, for [`crate::pipeline::Stage::settings`].
+/// Name and file checksums of an installed network, for [`crate::pipeline::Stage::settings`].
 pub fn identity(model: &Installed) -> Result<String> {
     let sums: Vec<String> = model.files()?.into_iter().map(|f| f.sha256).collect();
     Ok(format!("{} {sums:?}", model.name))
 }
 
-/// The built-in keypoint detector, for the search of cameras.
+/// The built-in keypoint detector of structure from motion.
 pub fn keypoints(registry: &Registry) -> Result<impl FnMut(&RgbImage) -> Result<Keypoints> + use<>> {
     let mut xfeat = XFeat::load(registry)?;
     Ok(move |image: &RgbImage| {

@@ -8,7 +8,7 @@ use crate::pose::Geometry;
 
 /// The colour stage.
 pub struct TrainColour {
-    /// How.
+    /// Options of the training.
     pub options: RgbOptions,
 }
 
@@ -34,9 +34,9 @@ impl Stage for TrainColour {
     }
 }
 
-/// Colours that depend on the direction, where the photos support them.
+/// Fits view-dependent colour where the photos support it.
 pub struct ViewDependence {
-    /// How.
+    /// Options of the fit.
     pub options: ViewDependentOptions,
 }
 
@@ -56,7 +56,7 @@ impl Stage for ViewDependence {
 
     fn run(self, (placed, trained): (&PlacedPhotos, &Trained), context: &Context) -> Result<Trained> {
         let (images, coverage) = shared::targets(&placed.photos);
-        // Where the same points look as bright from every photo there is nothing to try.
+        // If every photo shows the same points equally bright, no degree is tried.
         let matt = placed.photos.iter().all(|p| p.light.explains_the_photo());
         let degree = self.options.degree.or(matt.then_some(0));
         let options = ViewDependentOptions { degree, ..self.options };
