@@ -1,8 +1,11 @@
-"""What tools/formats/check runs: every format through a reader or writer that is not ours."""
+"""The checks of tools/formats/check: every format through a reader or writer that is not ours, JSON against its schemas."""
 import json
+import os
+import struct
 import subprocess
 import sys
 import tempfile
+import zlib
 from pathlib import Path
 
 import gsply
@@ -12,7 +15,11 @@ import plyfile
 import pycolmap
 import pygltflib
 from gsply.spz import read_spz, write_spz
+from jsonschema import Draft202012Validator
+from jsonschema.exceptions import best_match
+from referencing import Registry, Resource
 
+SCHEMAS = Path(__file__).resolve().parents[2] / "docs/use/schemas"
 SPLATVK, SCENE = Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve()
 WORK = Path(tempfile.mkdtemp(prefix="splatvk-formats-"))
 C0 = 0.28209479177387814
@@ -365,7 +372,132 @@ def language():
     print("ok  language beside compressed ply answers a query")
 
 
+def validators():
+    """A function that holds a value to a schema of docs/use/schemas, by the name of the schema."""
+    schemas = {p.name.removesuffix(".schema.json"): json.loads(p.read_text()) for p in SCHEMAS.glob("*.schema.json")}
+    registry = Registry().with_resources((s["$id"], Resource.from_contents(s)) for s in schemas.values())
+    for name, schema in schemas.items():
+        Draft202012Validator.check_schema(schema)
+        assert schema["$id"].endswith(f"/{name}.schema.json"), f"{name}.schema.json: its $id is {schema['$id']}"
+
+    def hold(name, value, place):
+        error = best_match(Draft202012Validator(schemas[name], registry=registry).iter_errors(value))
+        assert error is None, f"{place}: {error.json_path}: {error.message} ({name}.schema.json)"
+
+    return sorted(set(schemas) - {"common"}), hold
+
+
+def read_lines(text):
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def grey(path, pixels):
+    """An 8-bit greyscale PNG."""
+    h, w = pixels.shape
+    chunk = lambda kind, data: struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    rows = np.column_stack([np.zeros(h, "u1"), pixels.astype("u1")]).tobytes()
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", w, h, 8, 0, 0, 0, 0))
+                     + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b""))
+
+
+def ground_truth(folder):
+    """Ground truth of the scene's own cameras, photos and depth; the left half of each photo is the object, and the first
+    photo is a held-out frame, too. Returns the content of ground_truth.json."""
+    frames = []
+    for name in ("images", "masks", "depth", "used"):
+        (folder / name).mkdir(parents=True)
+    poses = matrices()
+    for split, stem in [("train", stem) for stem in poses] + [("test", next(iter(poses)))]:
+        m, (fx, fy, cx, cy) = poses[stem]
+        depth = np.load(WORK / "maps" / f"{stem}_depth.npy")
+        h, w = depth.shape
+        name = stem if split == "train" else "held_out"
+        (folder / f"images/{name}.png").write_bytes((SCENE / f"cameras/images/{stem}.png").read_bytes())
+        grey(folder / f"masks/{name}.png", np.repeat([np.arange(w) < w // 2], h, axis=0))
+        grey(folder / f"used/{name}.png", 255 * np.repeat([np.arange(w) < w * 0.9], h, axis=0))
+        np.savez(folder / f"depth/{name}.npz", depth=depth)
+        frames.append({"file": f"images/{name}.png", "split": split, "fx": fx, "fy": fy, "cx": cx, "cy": cy,
+                       "world_to_camera": m.tolist()})
+    truth = {"width": w, "height": h, "labels": {"1": "lemon"}, "up": [0, -1, 0], "frames": frames}
+    (folder / "ground_truth.json").write_text(json.dumps(truth))
+    return truth
+
+
+def examples(names, hold):
+    """Every schema has an example that fits it."""
+    for name in names:
+        example = SCHEMAS / "examples" / (f"{name}.jsonl" if name == "log" else f"{name}.json")
+        for value in read_lines(example.read_text()) if name == "log" else [json.loads(example.read_text())]:
+            hold(name, value, example.name)
+    strays = {p.stem for p in (SCHEMAS / "examples").iterdir()} - set(names)
+    assert not strays, f"examples without a schema: {strays}"
+    print(f"ok  examples of {len(names)} JSON schemas")
+
+
+def json_formats():
+    """Examples of docs/use/schemas, and JSON that splatvk writes now, against their schemas."""
+    names, hold = validators()
+    examples(names, hold)
+    # Stages of training stay in a folder of their own; models and ONNX Runtime are those that are installed.
+    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share"
+    home, installed = WORK / "home", Path(os.environ.get("SPLATVK_HOME") or Path(data) / "splatvk")
+    home.mkdir()
+    for part in ("lib", "models"):
+        (home / part).symlink_to(installed / part)
+
+    def said(name, *args):
+        """Holds the output of a command with --json to a schema, and its log to that of logs; returns the log's events. Without
+        a name the command may fail."""
+        done = subprocess.run([SPLATVK, "--log", "json", *map(str, args)], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                              env={**os.environ, "SPLATVK_HOME": str(home)})
+        lines = read_lines(done.stderr.decode())
+        for line in lines:
+            hold("log", line, f"log of {args[0]}")
+        if name is not None:
+            assert done.returncode == 0, lines
+            hold(name, json.loads(done.stdout), f"output of {args[0]}")
+        return {line["event"] for line in lines}
+
+    def scene(folder):
+        for file, name in [("scene.json", "scene"), ("run.json", "run"), ("cameras/photos.json", "photos"),
+                           ("cameras/transforms.json", "transforms"), ("cameras/original/transforms.json", "transforms"),
+                           ("cameras/original/transforms.json", "transforms-read")]:
+            hold(name, json.loads((folder / file).read_text()), folder / file)
+
+    scene(SCENE)
+    hold("answers", json.loads((WORK / "answers/answers.json").read_text()), "answers.json")
+    hold("transforms", json.loads((WORK / "transforms.json").read_text()), "export --format transforms")
+    print("ok  JSON of the scene directory, its answers and its exported cameras")
+
+    truth = WORK / "truth"
+    hold("ground_truth", ground_truth(truth), "ground_truth.json")
+    events = said("answers", "query", SCENE, "a mug without a handle", "--json")
+    events |= said("eval", "eval", SCENE, "--ground-truth", truth, "--out", WORK / "eval", "--json")
+    hold("eval", json.loads((WORK / "eval/eval.json").read_text()), "eval.json")
+    events |= said("measure", "measure", SCENE, "0,0,1 - 1,0,1", "--json")
+    events |= said("models-list", "models", "list", "--json")
+    events |= said("doctor", "doctor", "--json")
+    said(None, "bench", "--splats", 500, "--width", 64, "--height", 48, "--features", 0, "--repeats", 1, "--json",
+         WORK / "bench.json")
+    hold("bench", json.loads((WORK / "bench.json").read_text()), "bench --json")
+    # A scene without language, with masks and a scale; the examples of camera files are rendered from it.
+    small = WORK / "small"
+    cameras = SCENE / "cameras"
+    events |= said("train", "train", "--images", cameras / "images", "--cameras", cameras / "transforms.json", "--points",
+                   SCENE / "point_cloud.ply", "--photo-masks", truth / "used", "--iterations", 10, "--max-size", 64, "--preset",
+                   "draft", "--out", small, "--json")
+    events |= said("measure", "measure", small, "--scale", "0,0,1 - 1,0,1 = 21cm", "--json")
+    scene(small)
+    for name in ("cameras", "transforms", "transforms-read"):
+        said(None, "render", small, "--cameras", SCHEMAS / f"examples/{name}.json", "--out", WORK / f"by-{name}")
+        assert any(WORK.glob(f"by-{name}/*.png")), f"{name}.json: nothing was rendered"
+    events |= said(None, "query", WORK / "nowhere", "lemon")
+    assert events >= {"begin", "step", "figures", "end", "error"}, f"the logs only have {sorted(events)}"
+    print("ok  output and logs of query, eval, measure, train, models list, doctor and bench")
+
+
 splats()
 cameras()
 images()
 language()
+json_formats()
