@@ -1,5 +1,5 @@
-//! A device that is lost, or has no memory left, in the middle of training: what is said of it, and
-//! that the same work goes on with another.
+//! Training on a device that is lost or runs out of memory: the error, and the continuation on
+//! another device with the same result.
 #![allow(clippy::unwrap_used, clippy::panic)] // a panic is how a test fails
 use glam::DVec2;
 use splatlab::generate::{self, SceneSpec};
@@ -24,7 +24,7 @@ fn device() -> Device {
     Device::open(&Options { deterministic: true, ..splatvk::gpu::options(None) }).unwrap()
 }
 
-/// Three photos of a generated scene, and its exact cameras with a point for every fourth pixel.
+/// Three photos of a generated scene, its exact cameras, and a point for every fourth pixel.
 fn scene() -> (Vec<Photo>, Geometry) {
     let spec = SceneSpec { seed: 1000, views: 3, size: (96, 72), ..SceneSpec::default() };
     let world = generate::build_scene(&spec).unwrap();
@@ -49,7 +49,7 @@ fn scene() -> (Vec<Photo>, Geometry) {
     (photos, geometry)
 }
 
-/// The steps after which figures were reported.
+/// Records the steps after which figures were reported.
 #[derive(Default)]
 struct Steps(Mutex<Vec<u64>>);
 
@@ -63,7 +63,7 @@ impl Progress for Steps {
     fn warn(&self, _: &str) {}
 }
 
-/// Trains, and says which steps were reported.
+/// Trains the colour stage; returns its output and the reported steps.
 fn train(device: &Device, store: &Store) -> (splatvk::Result<Trained>, Vec<u64>) {
     let (photos, geometry) = scene();
     let mut graph = Graph::default();
@@ -81,19 +81,19 @@ fn train(device: &Device, store: &Store) -> (splatvk::Result<Trained>, Vec<u64>)
 }
 
 #[test]
-fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
+fn training_resumes_bitwise_after_lost_device() {
     let whole_device = device();
     let (whole, _) = train(&whole_device, &Store::none());
     let (whole, submissions) = (whole.unwrap(), whole_device.submissions());
 
     let folder = tempfile::tempdir().unwrap();
     let kept = || Store::at(folder.path(), true, Duration::ZERO);
-    // Before anything is kept there is nothing to go on from.
+    // A store that keeps no state: the error names none.
     let lost = device();
     lost.lose_after(0);
     let error = train(&lost, &Store::none()).0.unwrap_err();
     assert!(matches!(error, Error::DeviceLost { kept: None, .. }), "{error:?}");
-    // In the middle of training, twice.
+    // Loses the device in the middle of training, twice.
     let mut begun = 0;
     for share in [3, 2] {
         let lost = device();
@@ -105,11 +105,11 @@ fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
         let text = error.to_string();
         assert!(text.contains("the device was lost") && text.contains("--resume"), "{text}");
         assert!(!text.contains('\n') && text.ends_with(kept), "{text}");
-        // The state is kept after every step, figures come with some.
+        // The state is kept after every step; figures are reported after some steps.
         let named: u64 = kept.strip_prefix("stage splats after step ").unwrap().parse().unwrap();
         assert!(steps.iter().all(|s| (begun..=named).contains(s)) && named > begun, "{steps:?}, {text}");
         begun = named;
-        // Nothing works on it any more, and nothing hangs.
+        // Later work on the lost device fails and does not hang.
         let buffer = lost.buffer::<u32>("after", 4).unwrap();
         let mut after = Recorder::new(&lost, "after");
         after.fill(&buffer, 1);
@@ -118,7 +118,7 @@ fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
     assert!(begun > 0 && begun < STEPS as u64, "lost in the middle: step {begun}");
     let (resumed, steps) = train(&device(), &kept());
     let resumed = resumed.unwrap();
-    assert!(steps[0] >= begun, "it goes on where it was: {steps:?} after {begun}");
+    assert!(steps[0] >= begun, "first reported step {steps:?}, kept step {begun}");
     assert!(resumed.splats == whole.splats && resumed.cameras == whole.cameras, "the same bits");
     let left = Store::list(folder.path());
     let states = left.iter().filter(|(file, _)| file.to_string_lossy().contains("-state-"));
@@ -126,7 +126,7 @@ fn a_lost_device_is_named_and_training_goes_on_elsewhere_with_the_same_bits() {
 }
 
 #[test]
-fn a_device_without_memory_is_named_with_what_is_kept_and_the_work_goes_on_once_there_is_some() {
+fn training_resumes_bitwise_after_out_of_memory() {
     let whole_device = device();
     let (whole, _) = train(&whole_device, &Store::none());
     let (whole, buffers) = (whole.unwrap(), whole_device.memory().allocations);
@@ -146,7 +146,7 @@ fn a_device_without_memory_is_named_with_what_is_kept_and_the_work_goes_on_once_
         assert!(text.ends_with(kept) && text.contains("--resume") && text.contains("fewer splats"), "{text}");
         assert!(doing.contains("buffer") && error.exit_code() == 1 && error.source().is_some(), "{text}");
         stages.push(kept.clone());
-        // There is memory again: what was refused has broken nothing.
+        // The device works again once it has memory.
         full.exhaust_after(u64::MAX / 2);
         assert!(full.buffer::<u32>("after", 4).is_ok());
     }

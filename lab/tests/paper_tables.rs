@@ -1,5 +1,5 @@
-//! The tables on data sets in the published layouts, and the driver of all of them, on small fakes
-//! made from generated scenes.
+//! Tables on data sets of the published layouts, and the script that runs all of them, on small
+//! imitations made from generated scenes.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 use image::GenericImageView;
 use serde_json::{Value, json};
@@ -11,8 +11,7 @@ fn splatlab(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_splatlab")).args(args).output().unwrap()
 }
 
-/// The program that lists the installed networks; `cargo test --workspace` builds it beside this
-/// one.
+/// Path of `splatvk`, which `cargo test --workspace` builds beside `splatlab`.
 fn splatvk() -> PathBuf {
     let program = Path::new(env!("CARGO_BIN_EXE_splatlab")).with_file_name("splatvk");
     assert!(program.is_file(), "{}: build it with cargo build", program.display());
@@ -27,19 +26,22 @@ fn path(p: &Path) -> &str {
     p.to_str().unwrap()
 }
 
-/// A generated scene, and what of it the fakes need.
+/// A generated scene.
 struct Scene {
     folder: tempfile::TempDir,
     truth: Value,
 }
 
-/// One frame: (stem, photo, object index per pixel, world to camera, intrinsics fx fy cx cy).
+/// A frame of the ground truth.
 struct Frame {
     stem: String,
     photo: image::DynamicImage,
+    /// Object index per pixel.
     objects: image::GrayImage,
+    /// World to camera.
     pose: [[f64; 4]; 4],
-    optics: [f64; 4],
+    /// fx, fy, cx, cy.
+    intrinsics: [f64; 4],
 }
 
 impl Scene {
@@ -56,22 +58,10 @@ impl Scene {
 
     fn frames(&self) -> Vec<Frame> {
         let data = self.folder.path().join("data");
-        let one = |f: &Value| {
-            let file = f["file"].as_str().unwrap();
-            let stem = Path::new(file).file_stem().unwrap().to_str().unwrap().to_owned();
-            let masks = image::open(data.join("masks").join(format!("{stem}.png"))).unwrap();
-            Frame {
-                photo: image::open(data.join(file)).unwrap(),
-                objects: masks.to_luma8(),
-                pose: serde_json::from_value(f["world_to_camera"].clone()).unwrap(),
-                optics: ["fx", "fy", "cx", "cy"].map(|k| f[k].as_f64().unwrap()),
-                stem,
-            }
-        };
-        self.truth["frames"].as_array().unwrap().iter().map(one).collect()
+        self.truth["frames"].as_array().unwrap().iter().map(|f| Frame::read(&data, f)).collect()
     }
 
-    /// Objects without the surfaces behind them.
+    /// Phrases of the objects by index, without the background.
     fn labels(&self) -> BTreeMap<u8, String> {
         let all: BTreeMap<u8, String> = serde_json::from_value(self.truth["labels"].clone()).unwrap();
         let behind = ["table", "wall", "carpet", "floor"];
@@ -79,7 +69,23 @@ impl Scene {
     }
 }
 
-/// Camera to world of a rigid world to camera.
+impl Frame {
+    /// Reads a frame of `ground_truth.json`.
+    fn read(data: &Path, f: &Value) -> Frame {
+        let file = f["file"].as_str().unwrap();
+        let stem = Path::new(file).file_stem().unwrap().to_str().unwrap().to_owned();
+        let masks = image::open(data.join("masks").join(format!("{stem}.png"))).unwrap();
+        Frame {
+            photo: image::open(data.join(file)).unwrap(),
+            objects: masks.to_luma8(),
+            pose: serde_json::from_value(f["world_to_camera"].clone()).unwrap(),
+            intrinsics: ["fx", "fy", "cx", "cy"].map(|k| f[k].as_f64().unwrap()),
+            stem,
+        }
+    }
+}
+
+/// Inverse of a rigid transform.
 fn to_world(m: &[[f64; 4]; 4]) -> [[f64; 4]; 4] {
     let mut out = [[0.0, 0.0, 0.0, 0.0], [0.0; 4], [0.0; 4], [0.0, 0.0, 0.0, 1.0]];
     for r in 0..3 {
@@ -89,7 +95,7 @@ fn to_world(m: &[[f64; 4]; 4]) -> [[f64; 4]; 4] {
     out
 }
 
-/// Outline of an object, row by row: exact for what is convex along rows.
+/// Outline of an object and its bounding box; exact for shapes that are convex along rows.
 fn polygon(objects: &image::GrayImage, label: u8) -> (Vec<[f64; 2]>, [f64; 4]) {
     let (mut left, mut right) = (Vec::new(), Vec::new());
     for y in 0..objects.height() {
@@ -114,18 +120,18 @@ fn polygon(objects: &image::GrayImage, label: u8) -> (Vec<[f64; 2]>, [f64; 4]) {
 
 /// `transforms.json` as nerfstudio writes it: camera to world in OpenGL axes.
 fn transforms(frames: &[Frame]) -> Value {
-    let one = |f: &Frame| {
+    let frame_json = |f: &Frame| {
         let mut m = to_world(&f.pose);
         m.iter_mut().take(3).for_each(|row| (1..3).for_each(|c| row[c] = -row[c]));
-        let [fx, fy, cx, cy] = f.optics;
+        let [fx, fy, cx, cy] = f.intrinsics;
         let (w, h) = f.photo.dimensions();
         json!({ "file_path": format!("images/{}.jpg", f.stem), "transform_matrix": m, "fl_x": fx, "fl_y": fy, "cx": cx,
                 "cy": cy, "w": w, "h": h })
     };
-    json!({ "frames": frames.iter().map(one).collect::<Vec<_>>() })
+    json!({ "frames": frames.iter().map(frame_json).collect::<Vec<_>>() })
 }
 
-/// `lerf_ovs/SCENE` and `lerf_ovs/label/SCENE`, every other photo labelled.
+/// Writes `ROOT/SCENE` and `ROOT/label/SCENE` in the layout of LERF-OVS.
 fn as_lerf(scene: &Scene, root: &Path, name: &str) {
     let (images, labels) = (root.join(name).join("images"), root.join("label").join(name));
     std::fs::create_dir_all(&images).unwrap();
@@ -148,6 +154,7 @@ fn as_lerf(scene: &Scene, root: &Path, name: &str) {
     std::fs::write(root.join(name).join("transforms.json"), transforms(&frames).to_string()).unwrap();
 }
 
+/// Writes a scene in the layout of 3D-OVS.
 fn as_ovs(scene: &Scene, root: &Path, name: &str) {
     let folder = root.join(name);
     std::fs::create_dir_all(folder.join("images")).unwrap();
@@ -167,15 +174,12 @@ fn as_ovs(scene: &Scene, root: &Path, name: &str) {
     std::fs::write(folder.join("transforms.json"), transforms(&frames).to_string()).unwrap();
 }
 
-/// A scan whose objects are chairs and whose wall is a wall.
+/// Writes a scene in the layout of ScanNet: objects are chairs, everything else is wall.
 fn as_scannet(scene: &Scene, root: &Path, name: &str) {
     let folder = root.join(name);
     for inner in ["color", "label-filt", "pose", "intrinsic"] {
         std::fs::create_dir_all(folder.join(inner)).unwrap();
     }
-    let matrix = |m: &[[f64; 4]; 4]| {
-        m.iter().map(|r| r.map(|v| v.to_string()).join(" ")).collect::<Vec<_>>().join("\n")
-    };
     let solid = scene.labels();
     for (k, f) in scene.frames().iter().enumerate() {
         let stem = (10 * k).to_string();
@@ -185,16 +189,20 @@ fn as_scannet(scene: &Scene, root: &Path, name: &str) {
             image::Luma([if solid.contains_key(&f.objects.get_pixel(x, y).0[0]) { 2 } else { 1 }])
         });
         raw.save(folder.join(format!("label-filt/{stem}.png"))).unwrap();
-        std::fs::write(folder.join(format!("pose/{stem}.txt")), matrix(&to_world(&f.pose))).unwrap();
-        let [fx, fy, cx, cy] = f.optics;
+        std::fs::write(folder.join(format!("pose/{stem}.txt")), matrix_text(&to_world(&f.pose))).unwrap();
+        let [fx, fy, cx, cy] = f.intrinsics;
         let k = [[fx, 0.0, cx, 0.0], [0.0, fy, cy, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
-        std::fs::write(folder.join("intrinsic/intrinsic_color.txt"), matrix(&k)).unwrap();
+        std::fs::write(folder.join("intrinsic/intrinsic_color.txt"), matrix_text(&k)).unwrap();
     }
     let table = "id\traw_category\tcategory\tnyu40id\n1\twall\twall\t1\n2\tchair\tchair\t5\n";
     std::fs::write(root.join("scannetv2-labels.combined.tsv"), table).unwrap();
 }
 
-/// Seconds instead of minutes.
+fn matrix_text(m: &[[f64; 4]; 4]) -> String {
+    m.iter().map(|r| r.map(|v| v.to_string()).join(" ")).collect::<Vec<_>>().join("\n")
+}
+
+/// Options of a run of seconds instead of minutes.
 const SHORT: [&str; 7] =
     ["--iterations", "10", "--language-iterations", "2", "--true-cameras", "--max-points", "5000"];
 
@@ -210,22 +218,19 @@ fn row<'r>(report: &'r Value, label: &str) -> &'r Value {
     rows.iter().find(|r| r["label"] == label).expect(label)
 }
 
-/// True masks with the embeddings of their labels: whatever layout they lie in, they are found
-/// again.
 #[test]
 #[ignore = "takes long: tools/test-long"]
-fn true_segmentation_is_found_again_in_every_layout() {
+fn true_segmentation_scores_in_every_layout() {
     let scene = Scene::generate("1003");
     let root = tempfile::tempdir().unwrap();
     as_lerf(&scene, &root.path().join("lerf_ovs"), "teatime");
     as_ovs(&scene, &root.path().join("3d_ovs"), "bed");
     as_scannet(&scene, &root.path().join("scannet"), "scene0000_00");
     for (layout, data, paper, least) in [
-        // LERF's masks are cut from smoothed maps: at this size edges move by a good part of an
-        // object.
+        // LERF's masks are cut from smoothed maps: at this size edges move by much of an object.
         ("lerf", "lerf_ovs/teatime", 0.7125, 0.6),
-        // Nothing has the 2000 pixels that a mask of the paper's rule needs: every answer is the
-        // substitute's.
+        // No object has the 2000 pixels that the paper's rule asks of a mask, so every answer is
+        // that of the substitute rule.
         ("3dovs", "3d_ovs/bed", f64::NAN, 0.55),
         ("scannet", "scannet/scene0000_00", 0.4709, 0.8),
     ] {
@@ -239,7 +244,7 @@ fn true_segmentation_is_found_again_in_every_layout() {
         let figure = |name: &str| figures[name].as_f64().unwrap_or(f64::NAN);
         assert!(figure("mIoU") > least && figure("SIM") > 0.9, "{layout}: {figures}");
         assert!(figure("Tr.T") > 0.0 && figure("T.T") > figure("Tr.T"), "{layout}: {figures}");
-        // Without the true masks less is found.
+        // Found masks score less than true ones.
         let own = row(&report, "sparselgs")["figures"]["mIoU"].as_f64().unwrap();
         assert!(own < figure("mIoU"), "{layout}: {own} {figures}");
         for label in ["features of lseg", "lseg in 2D"] {
@@ -255,7 +260,7 @@ fn true_segmentation_is_found_again_in_every_layout() {
 
 #[test]
 #[ignore = "takes long: tools/test-long"]
-fn the_driver_runs_what_is_there_and_says_what_is_missing() {
+fn driver_runs_available_data_sets() {
     let root = tempfile::tempdir().unwrap();
     let (data, out) = (root.path().join("data"), root.path().join("out"));
     for (seed, name) in [("1003", "teatime"), ("1004", "ramen")] {
@@ -291,7 +296,7 @@ fn the_driver_runs_what_is_there_and_says_what_is_missing() {
     let steps = page.lines().find(|l| l.starts_with("| steps 1, 2, 3 |")).unwrap();
     assert!(steps.contains(" ± ") && steps.contains("(0.538)") && steps.contains("| 2 |"), "{steps}");
     assert!(page.contains("mIoU by scene") && page.contains("lerf: figurines lacks"), "{page}");
-    // The second call takes every row from the first.
+    // The second call reuses every row.
     let seconds = || {
         let report = read(&out.join("lerf-1/ablate.json"));
         let all = report["measurements"].as_array().unwrap().clone();

@@ -1,4 +1,4 @@
-//! Generated data and the tables on it, as a user runs them.
+//! Generated data and the tables on it, by the program.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -18,9 +18,8 @@ fn path(p: &Path) -> &str {
     p.to_str().unwrap()
 }
 
-/// One small scene through generate and ablate.
 #[test]
-fn a_generated_scene_is_ablated() {
+fn ablate_measures_generated_scene() {
     let folder = tempfile::tempdir().unwrap();
     let (data, out) = (folder.path().join("data"), folder.path().join("tables"));
     let small = [
@@ -46,8 +45,7 @@ fn a_generated_scene_is_ablated() {
     let rows = report["tables"][0]["rows"].as_array().unwrap();
     assert_eq!(rows.len(), 5);
     let figure = |row: usize, name: &str| rows[row]["figures"][name].as_f64();
-    // the bijection keeps every meaning, whatever the dimension; one photo in four objects' size is
-    // coarse, though
+    // The bijection keeps every embedding; mIoU is low because objects are small in these photos.
     assert!(
         figure(0, "SIM").unwrap() > figure(2, "SIM").unwrap() && figure(0, "mIoU").unwrap() > 0.3,
         "{rows:?}"
@@ -58,20 +56,21 @@ fn a_generated_scene_is_ablated() {
     }
 }
 
-/// Two scenes and one that cannot be read, with two seeds; what they share runs once, and the
-/// second call takes it all from the first.
+/// Two scenes and an unreadable one, with two seeds: shared stages run once, the unreadable scene
+/// becomes a note, and the second call takes every row from the first.
 #[test]
 #[ignore = "takes long: tools/test-long"]
-fn scenes_and_seeds_have_a_spread_and_a_failed_scene_is_a_note() {
+fn ablate_spreads_scenes_and_seeds() {
     let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
+    let path_of = |name: &str| folder.path().join(name);
     let small = ["--size", "160x120", "--views", "3", "--held-out", "2", "--objects", "4"];
     for (name, seed) in [("a", "1000"), ("b", "1001"), ("broken", "1000")] {
-        let made = splatlab(&[&["generate", "--out", path(&at(name)), "--seed", seed], &small[..]].concat());
+        let made =
+            splatlab(&[&["generate", "--out", path(&path_of(name)), "--seed", seed], &small[..]].concat());
         assert!(made.status.success());
     }
-    std::fs::remove_dir_all(at("broken/images")).unwrap();
-    let (a, b, broken, out) = (at("a"), at("b"), at("broken"), at("out"));
+    std::fs::remove_dir_all(path_of("broken/images")).unwrap();
+    let (a, b, broken, out) = (path_of("a"), path_of("b"), path_of("broken"), path_of("out"));
     let ablate = || {
         let mut args =
             vec!["--log", "json", "ablate", "alignment", "--data", path(&broken), path(&a), path(&b)];
@@ -109,14 +108,14 @@ fn scenes_and_seeds_have_a_spread_and_a_failed_scene_is_a_note() {
     );
     let note = row["note"].as_str().unwrap();
     assert!(note.starts_with("2 of 6 failed, first broken with seed 0: "), "{note}");
-    // Cameras are given, so that no random number enters before stereo: once per scene, training
-    // once per scene and seed.
+    // Cameras are given, so that stages before stereo use no random numbers: features run once per
+    // scene, training once per scene and seed.
     assert_eq!((begun("features"), begun("splats")), (2, 4));
     let text = std::fs::read_to_string(out.join("alignment.txt")).unwrap();
     assert!(text.contains(" ± ") && text.contains("Δ mIoU"), "{text}");
     let (again, begun) = ablate();
     assert_eq!((begun("features"), begun("splats")), (0, 0));
-    // Numbers may change in their last digit on the way through the file.
+    // Numbers may change in their last digit when they are written and read.
     let row = &again["tables"][0]["rows"][0];
     let miou = |row: &serde_json::Value| row["figures"]["mIoU"].as_f64().unwrap();
     assert!((miou(row) - miou(&report["tables"][0]["rows"][0])).abs() < 1e-12, "{row}");
@@ -124,12 +123,12 @@ fn scenes_and_seeds_have_a_spread_and_a_failed_scene_is_a_note() {
 }
 
 #[test]
-fn what_cannot_be_done_is_one_line_and_exit_code_two() {
+fn invalid_options_exit_with_code_two() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("out");
     let o = path(&out);
     let breakfast = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/breakfast");
-    for (args, says) in [
+    for (args, cause) in [
         (vec!["generate", "--out", o, "--size", "wide"], "640x480"),
         (vec!["generate", "--out", o, "--objects", "40"], "--objects"),
         (vec!["generate", "--out", o, "--wrong", "2"], "--wrong"),
@@ -146,13 +145,13 @@ fn what_cannot_be_done_is_one_line_and_exit_code_two() {
         let output = splatlab(&args);
         let text = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(2), "{args:?}\n{text}");
-        assert!(text.lines().count() == 1 && text.contains(says), "{args:?}\n{text}");
-        assert!(!out.exists(), "{args:?} left something behind");
+        assert!(text.lines().count() == 1 && text.contains(cause), "{args:?}\n{text}");
+        assert!(!out.exists(), "{args:?} created the output folder");
     }
 }
 
-/// A second command for one output folder is refused by the process that works there; a command
-/// that is told to stop leaves nothing behind.
+/// A second command for the output folder of a running process is refused; a command that SIGTERM
+/// stops leaves no files.
 #[cfg(unix)]
 #[test]
 fn output_folder_has_one_writer() {
@@ -166,10 +165,10 @@ fn output_folder_has_one_writer() {
         let mut first = Command::new(env!("CARGO_BIN_EXE_splatlab"));
         first.args(words).arg("--out").arg(&place).stdout(Stdio::null()).stderr(Stdio::null());
         let mut first = first.spawn().unwrap();
-        let marks =
+        let owner_files =
             [".out.partial-splatvk/owner", "out/.partial-splatvk/owner"].map(|m| folder.path().join(m));
         let begun = Instant::now();
-        while !marks.iter().any(|m| m.metadata().is_ok_and(|m| m.len() > 0)) {
+        while !owner_files.iter().any(|f| f.metadata().is_ok_and(|m| m.len() > 0)) {
             assert!(begun.elapsed() < Duration::from_secs(60), "{words:?}: nothing is reserved");
             std::thread::sleep(Duration::from_millis(20));
         }

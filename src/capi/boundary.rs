@@ -1,4 +1,4 @@
-//! Between C and Rust: panics, errors, pointers, texts and structures of other versions.
+//! Conversions between C and Rust: panics, errors, pointers, texts and versioned structures.
 use super::types::*;
 use crate::files::panic_text;
 use crate::sync::lock;
@@ -9,16 +9,16 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::Mutex;
 
-/// Most bytes of a text: longer than any path that a system takes. Questions have a limit of their own.
+/// Maximum of bytes of a text: longer than any path of a system. Queries have a smaller limit.
 const MOST_TEXT: usize = 1 << 16;
-/// Most structures of an array: photos, outputs, instances.
+/// Maximum of structures in an array: photos, outputs, instances.
 const MOST_STRUCTURES: usize = 1 << 20;
 
-/// What goes wrong in a call.
+/// Failure of a call.
 pub enum CallError {
-    /// The library's own error.
+    /// An error of the library.
     Error(Error),
-    /// The calling program's mistake.
+    /// Wrong use of the interface by the calling program.
     Argument(String),
 }
 
@@ -34,7 +34,7 @@ impl From<Error> for CallError {
     }
 }
 
-/// A mistake of the calling program.
+/// Returns a [`CallError::Argument`].
 pub fn bad_argument<T>(what: impl Into<String>) -> Result<T, CallError> {
     Err(CallError::Argument(what.into()))
 }
@@ -47,7 +47,7 @@ impl LastError {
     fn set(&self, text: String) {
         *lock(&self.0) = text;
     }
-    /// Copies the text out as a C string: see [`copy_text`].
+    /// Copies the text as a C string: see [`copy_text`].
     pub unsafe fn copy(&self, out: *mut c_char, bytes: usize) -> usize {
         // SAFETY: passed on.
         unsafe { copy_text(&lock(&self.0), out, bytes) }
@@ -55,11 +55,12 @@ impl LastError {
 }
 
 thread_local! {
-    /// Failures of calls that have no handle to keep them.
+    /// Text of the last failed call without a handle.
     static CREATION: RefCell<String> = const { RefCell::new(String::new()) };
 }
 
-/// Runs the body of a function with a handle: nothing unwinds into C, and a failure leaves its text with the handle.
+/// Runs the body of a function with a handle. No panic unwinds into C; the handle keeps the text of
+/// a failure.
 pub fn guard(store: &LastError, body: impl FnOnce() -> Result<(), CallError>) -> SvkStatus {
     caught(|text| store.set(text), body)
 }
@@ -80,6 +81,7 @@ pub fn guard_number<T: Default>(body: impl FnOnce() -> T) -> T {
     catch_unwind(AssertUnwindSafe(body)).unwrap_or_default()
 }
 
+/// Runs a body, catches panics, and passes the text of a failure to `store`.
 fn caught(store: impl FnOnce(String), body: impl FnOnce() -> Result<(), CallError>) -> SvkStatus {
     let (status, text) = match catch_unwind(AssertUnwindSafe(body)) {
         Ok(Ok(())) => return SvkStatus::Ok,
@@ -91,6 +93,7 @@ fn caught(store: impl FnOnce(String), body: impl FnOnce() -> Result<(), CallErro
     status
 }
 
+/// Status of an error.
 fn status(e: &Error) -> SvkStatus {
     match e {
         Error::Input(_) => SvkStatus::Input,
@@ -113,17 +116,17 @@ fn status(e: &Error) -> SvkStatus {
 /// # Safety
 /// `repr(C)`, the first field is `size: usize`, and zero bytes are a value.
 pub unsafe trait Versioned: Copy {
-    /// For messages.
+    /// Name in messages.
     const NAME: &'static str;
-    /// Size of the first version: what every caller has at least.
+    /// Size of the first version, bytes: the smallest that a caller can have.
     const FIRST: usize;
 }
 
-/// Sizes of the first versions in bytes, where pointers have 64 bits: literal, so that a field that is appended does not change
-/// them.
+/// Sizes of the first versions in bytes, for pointers of 64 bits. They are literals, so that an
+/// appended field does not change them.
 macro_rules! versioned {
     ($($name:ident $first:literal),*) => {$(
-        // SAFETY: integers, floats, raw pointers and optional functions behind a leading size, all `repr(C)`.
+        // SAFETY: `repr(C)` integers, floats, raw pointers and optional functions after a size.
         unsafe impl Versioned for $name {
             const NAME: &'static str = stringify!($name);
             const FIRST: usize = if cfg!(target_pointer_width = "64") { $first } else { size_of::<$name>() };
@@ -145,22 +148,22 @@ versioned!(
     SvkInstance 224
 );
 
-/// The size that a structure states.
+/// Size that a structure states, bytes.
 ///
 /// # Safety
-/// `pointer` leads to a versioned structure.
+/// `pointer` points to a versioned structure.
 unsafe fn stated_size<T: Versioned>(pointer: *const T) -> Result<usize, CallError> {
     // SAFETY: per the contract; every versioned structure starts with its size.
     let size = unsafe { pointer.cast::<usize>().read() };
-    // Far beyond anything a later version may add: an uninitialised field.
+    // No later version adds so much: the field is uninitialised.
     if size < T::FIRST || size > T::FIRST + 4096 {
         return bad_argument(format!("{}.size is {size}; set it to sizeof({})", T::NAME, T::NAME));
     }
     Ok(size)
 }
 
-/// Reads a structure that may be of an older or newer version. Fields that only we know are zero; fields that only the
-/// caller knows must be zero.
+/// Reads a structure of an older or newer version. Fields that the caller's version lacks become
+/// zero; fields that this version lacks must be zero.
 pub unsafe fn read<T: Versioned>(pointer: *const T) -> Result<T, CallError> {
     if pointer.is_null() {
         return bad_argument(format!("the pointer to {} is null", T::NAME));
@@ -183,7 +186,7 @@ pub unsafe fn read<T: Versioned>(pointer: *const T) -> Result<T, CallError> {
     }
 }
 
-/// [`read`] that takes null for all zero.
+/// [`read`] with zero for a null pointer.
 pub unsafe fn read_or_default<T: Versioned>(pointer: *const T) -> Result<T, CallError> {
     if pointer.is_null() {
         // SAFETY: zero bytes are a value of T.
@@ -193,7 +196,7 @@ pub unsafe fn read_or_default<T: Versioned>(pointer: *const T) -> Result<T, Call
     unsafe { read(pointer) }
 }
 
-/// [`read`] of an array; the elements are as far apart as the first one says it is large.
+/// [`read`] of an array; its stride is the size that the first element states.
 pub unsafe fn read_array<T: Versioned>(pointer: *const T, count: usize) -> Result<Vec<T>, CallError> {
     if count == 0 {
         return Ok(Vec::new());
@@ -210,7 +213,7 @@ pub unsafe fn read_array<T: Versioned>(pointer: *const T, count: usize) -> Resul
     (0..count).map(|i| unsafe { read(pointer.cast::<u8>().add(i * stride).cast::<T>()) }).collect()
 }
 
-/// Fills a structure of the caller, as far as its version goes; its size stays.
+/// Fills the fields of a caller's structure that its version has; its size stays.
 pub unsafe fn write<T: Versioned>(pointer: *mut T, value: &T) -> Result<(), CallError> {
     if pointer.is_null() {
         return bad_argument(format!("the pointer to {} is null", T::NAME));
@@ -226,7 +229,8 @@ pub unsafe fn write<T: Versioned>(pointer: *mut T, value: &T) -> Result<(), Call
     Ok(())
 }
 
-/// Fills as many structures of an array of the caller as it has; they are as far apart as the first one says it is large.
+/// Fills at most `count` structures of a caller's array; its stride is the size that the first
+/// element states.
 pub unsafe fn write_array<T: Versioned>(
     pointer: *mut T,
     count: usize,
@@ -240,21 +244,21 @@ pub unsafe fn write_array<T: Versioned>(
     }
     // SAFETY: not null, so the first of the caller's structures.
     let stride = unsafe { stated_size(pointer) }?;
-    let mut places = values.iter().take(count).enumerate();
+    let mut elements = values.iter().take(count).enumerate();
     // SAFETY: the caller gives `count` structures of this size.
-    places.try_for_each(|(i, v)| unsafe { write(pointer.cast::<u8>().add(i * stride).cast::<T>(), v) })
+    elements.try_for_each(|(i, v)| unsafe { write(pointer.cast::<u8>().add(i * stride).cast::<T>(), v) })
 }
 
-/// A text of the caller; `None` for null.
+/// Copies a text of the caller; `None` for null.
 pub unsafe fn text(pointer: *const c_char, what: &str) -> Result<Option<String>, CallError> {
     if pointer.is_null() {
         return Ok(None);
     }
-    // SAFETY: a null-terminated text, per the header: nothing is read behind its end.
+    // SAFETY: a null-terminated text, per the header; reading stops at its end.
     let Some(length) = (0..=MOST_TEXT).find(|k| unsafe { pointer.add(*k).read() } == 0) else {
         return bad_argument(format!("{what} has more than {MOST_TEXT} bytes, or no zero byte at its end"));
     };
-    // SAFETY: so many bytes were read before the zero.
+    // SAFETY: `length` bytes were read before the zero.
     let bytes = unsafe { std::slice::from_raw_parts(pointer.cast::<u8>(), length) };
     match std::str::from_utf8(bytes) {
         Ok(text) => Ok(Some(text.to_owned())),
@@ -262,13 +266,14 @@ pub unsafe fn text(pointer: *const c_char, what: &str) -> Result<Option<String>,
     }
 }
 
-/// A path of the caller; `None` for null.
+/// Copies a path of the caller; `None` for null.
 pub unsafe fn path(pointer: *const c_char, what: &str) -> Result<Option<PathBuf>, CallError> {
     // SAFETY: passed on.
     Ok(unsafe { text(pointer, what) }?.map(PathBuf::from))
 }
 
-/// Copies a text with its end mark into `bytes` bytes at `out`, cut where it does not fit; returns the bytes that it needs.
+/// Copies a text with a terminating zero into `bytes` bytes at `out`, truncated where it does not
+/// fit. Returns the number of bytes that the whole text needs.
 pub unsafe fn copy_text(text: &str, out: *mut c_char, bytes: usize) -> usize {
     if !out.is_null() && bytes > 0 {
         let mut fits = text.len().min(bytes - 1);
@@ -284,7 +289,7 @@ pub unsafe fn copy_text(text: &str, out: *mut c_char, bytes: usize) -> usize {
     text.len() + 1
 }
 
-/// A handle that the caller gives.
+/// Reference to a caller's handle; an error for null.
 pub unsafe fn handle<'a, T>(pointer: *const T, name: &str) -> Result<&'a T, CallError> {
     // SAFETY: null or a live handle, per the header.
     match unsafe { pointer.as_ref() } {
@@ -293,7 +298,7 @@ pub unsafe fn handle<'a, T>(pointer: *const T, name: &str) -> Result<&'a T, Call
     }
 }
 
-/// Where a new handle goes; null until there is one.
+/// Reference to a caller's pointer for a new handle, set to null; an error where it is null itself.
 pub unsafe fn slot<'a, T>(pointer: *mut *mut T) -> Result<&'a mut *mut T, CallError> {
     // SAFETY: null or a writable pointer, per the header.
     match unsafe { pointer.as_mut() } {
@@ -311,7 +316,7 @@ mod tests {
     use crate::gpu;
 
     #[test]
-    fn panics_and_errors_become_codes_with_a_text() {
+    fn guard_maps_panics_and_errors_to_status() {
         let store = LastError::default();
         let text = || store.0.lock().unwrap().clone();
         assert_eq!(guard(&store, || Ok(())), SvkStatus::Ok);
@@ -328,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn structures_of_other_versions() {
+    fn read_accepts_other_versions() {
         #[repr(C)]
         struct Newer {
             known: SvkSync,
@@ -338,7 +343,7 @@ mod tests {
         let mut newer: Newer = unsafe { std::mem::zeroed() };
         newer.known.size = size_of::<Newer>();
         newer.known.wait_value = 7;
-        // SAFETY: the structure is as large as it says.
+        // SAFETY: the structure has the size that it states.
         let back = unsafe { read(&raw const newer.known) };
         assert_eq!(back.ok().unwrap().wait_value, 7);
         newer.added = 1;
@@ -351,13 +356,13 @@ mod tests {
         let mut older: SvkTrainOptions = unsafe { std::mem::zeroed() };
         older.size = std::mem::offset_of!(SvkTrainOptions, max_size);
         (older.seed, older.max_size) = (3, 99);
-        // SAFETY: the structure is larger than it says.
+        // SAFETY: the structure is larger than the size that it states.
         let read = unsafe { read(&raw const older) }.ok().unwrap();
-        assert_eq!((read.seed, read.max_size), (3, 0), "a host of version 1 knows no max_size");
+        assert_eq!((read.seed, read.max_size), (3, 0), "version 1 has no max_size");
     }
 
     #[test]
-    fn texts_and_arrays_have_a_bound() {
+    fn texts_and_arrays_are_bounded() {
         let long = std::ffi::CString::new("a".repeat(MOST_TEXT + 1)).unwrap();
         let read = |text: &std::ffi::CStr| {
             // SAFETY: a null-terminated text.
@@ -377,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn texts_are_cut_between_characters_and_always_end() {
+    fn copy_text_truncates_between_characters() {
         let mut room = [1 as c_char; 6];
         // SAFETY: six bytes.
         let needed = unsafe { copy_text("aé€b", room.as_mut_ptr(), 6) };

@@ -7,24 +7,24 @@ use crate::infer::provider::NAMES;
 use crate::infer::{Compute, Registry};
 use std::ffi::{CStr, c_char, c_void};
 
-/// Version of this interface: major × 65536 + minor. A program runs with any library of the same major version and the
-/// same or a higher minor one.
+/// Version of this interface: major × 65536 + minor. A program works with any library of the same
+/// major version and the same or a higher minor version.
 pub const SVK_ABI_VERSION: u32 = 0x1_0000;
 
-/// A Vulkan device and where the models are.
+/// A Vulkan device and a folder of models.
 pub struct SvkContext {
     pub(super) device: Device,
     pub(super) registry: Registry,
     pub(super) error: LastError,
 }
 
-/// The SVK_ABI_VERSION of the library. Thread-safe.
+/// Returns the SVK_ABI_VERSION of the library. Thread-safe.
 #[unsafe(no_mangle)]
 pub extern "C" fn svk_abi_version() -> u32 {
     SVK_ABI_VERSION
 }
 
-/// The library's version, such as "0.1.0". Static memory. Thread-safe.
+/// Returns the version of the library, such as "0.1.0", in static memory. Thread-safe.
 #[unsafe(no_mangle)]
 pub extern "C" fn svk_version() -> *const c_char {
     const TEXT: &CStr = match CStr::from_bytes_with_nul(concat!(env!("CARGO_PKG_VERSION"), "\0").as_bytes()) {
@@ -34,8 +34,8 @@ pub extern "C" fn svk_version() -> *const c_char {
     TEXT.as_ptr()
 }
 
-/// Makes a context on a Vulkan device of its own. `options` may be NULL. On failure `*context` is NULL and the text is
-/// kept for the calling thread: svk_context_error(NULL, ...). Thread-safe.
+/// Creates a context on a new Vulkan device. `options` may be NULL. On failure `*context` is NULL,
+/// and svk_context_error(NULL, ...) returns the error text in the same thread. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_context_create(
     options: *const SvkContextOptions,
@@ -56,7 +56,8 @@ pub unsafe extern "C" fn svk_context_create(
     })
 }
 
-/// Makes a context on the host's own Vulkan device. `options` may be NULL. Otherwise like svk_context_create.
+/// Creates a context on a Vulkan device of the host. `options` may be NULL. Errors as of
+/// svk_context_create. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_context_adopt(
     device: *const SvkVulkanDevice,
@@ -76,6 +77,7 @@ pub unsafe extern "C" fn svk_context_adopt(
     })
 }
 
+/// Makes a context on the heap.
 unsafe fn boxed(device: Device, options: &SvkContextOptions) -> Result<*mut SvkContext, CallError> {
     // SAFETY: passed on.
     let models = unsafe { boundary::path(options.models, "SvkContextOptions.models") }?;
@@ -91,9 +93,10 @@ unsafe fn boxed(device: Device, options: &SvkContextOptions) -> Result<*mut SvkC
     Ok(Box::into_raw(Box::new(SvkContext { device, registry, error: LastError::default() })))
 }
 
-/// Drivers know some three hundred extensions.
+/// Maximum of extension names; drivers have about three hundred.
 const MOST_EXTENSIONS: u32 = 4096;
 
+/// Checks and converts the host's description of its device.
 unsafe fn host_device(given: &SvkVulkanDevice) -> Result<HostDevice, CallError> {
     let mut extensions = Vec::new();
     if given.extension_count > 0 {
@@ -106,13 +109,13 @@ unsafe fn host_device(given: &SvkVulkanDevice) -> Result<HostDevice, CallError> 
         if given.extensions.is_null() {
             return bad_argument("SvkVulkanDevice.extensions is null but extension_count is not 0");
         }
-        // SAFETY: as many texts as the structure says.
+        // SAFETY: the structure states the number of texts.
         let names = unsafe { std::slice::from_raw_parts(given.extensions, given.extension_count as usize) };
         // SAFETY: null-terminated texts.
         extensions.extend(names.iter().map(|n| unsafe { CStr::from_ptr(*n) }.to_owned()));
     }
-    // SAFETY: a pointer to vkGetInstanceProcAddr behind another type, as the header asks for; "C" and "system" are one
-    // calling convention wherever Vulkan is used on 64 bits.
+    // SAFETY: a pointer to vkGetInstanceProcAddr of another type, as the header asks for; "C" and
+    // "system" are the same calling convention on 64-bit platforms with Vulkan.
     let get = given
         .get_instance_proc_addr
         .map(|f| unsafe { std::mem::transmute::<unsafe extern "C" fn(), vk::PFN_vkGetInstanceProcAddr>(f) });
@@ -130,14 +133,15 @@ unsafe fn host_device(given: &SvkVulkanDevice) -> Result<HostDevice, CallError> 
     })
 }
 
-/// The host's `user` pointer, which its functions accept from any thread.
+/// The `user` pointer of the host; its functions accept it in any thread.
 struct User(*mut c_void);
 
-// SAFETY: only ever handed back to the host, whose functions are called from any thread by contract.
+// SAFETY: only passed back to the host's functions, which may be called from any thread.
 unsafe impl Send for User {}
 // SAFETY: as above.
 unsafe impl Sync for User {}
 
+/// Wraps the host's queue functions; `None` where it has none.
 fn queue_lock(given: &SvkVulkanDevice) -> Result<Option<QueueLock>, CallError> {
     let (lock, unlock) = match (given.lock_queue, given.unlock_queue) {
         (None, None) => return Ok(None),
@@ -147,7 +151,7 @@ fn queue_lock(given: &SvkVulkanDevice) -> Result<Option<QueueLock>, CallError> {
     let user = User(given.user);
     Ok(Some(Box::new(move |work: &mut dyn FnMut()| {
         let user = &user;
-        // SAFETY: the host's functions with the host's pointer; `work` does not panic (it submits to a queue).
+        // SAFETY: the host's functions and pointer; `work` submits to a queue and does not panic.
         unsafe {
             lock(user.0);
             work();
@@ -156,7 +160,8 @@ fn queue_lock(given: &SvkVulkanDevice) -> Result<Option<QueueLock>, CallError> {
     })))
 }
 
-/// Ends a context; scenes made from it stay usable. NULL is allowed. No other call with this context may be running.
+/// Destroys a context; its scenes stay usable. NULL is allowed. No other call with this context may
+/// be running.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_context_destroy(context: *mut SvkContext) {
     if !context.is_null() {
@@ -165,8 +170,9 @@ pub unsafe extern "C" fn svk_context_destroy(context: *mut SvkContext) {
     }
 }
 
-/// Copies the name of the Vulkan device into `text` (`bytes` long, always ended) and returns the bytes that it needs.
-/// Thread-safe.
+/// Copies the name of the Vulkan device into `text`, which has `bytes` bytes; it is truncated where
+/// it does not fit and always ends with a zero byte. Returns the number of bytes that the whole
+/// name needs. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_context_device_name(
     context: *const SvkContext,
@@ -181,8 +187,9 @@ pub unsafe extern "C" fn svk_context_device_name(
     })
 }
 
-/// Copies the text of the last failed call with this context (in any thread) into `text` (`bytes` long, always ended) and
-/// returns the bytes that it needs. NULL = the last failed creation of a context in this thread. Thread-safe.
+/// Copies the error text of the last failed call with this context, in any thread, into `text` as
+/// svk_context_device_name does; returns the number of bytes that the whole text needs. With
+/// `context` NULL: of the last failed creation of a context in this thread. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_context_error(
     context: *const SvkContext,

@@ -1,10 +1,10 @@
-//! The C ABI: `include/splatvk.h`, generated from this folder by cbindgen. Thin: what it does is in [`crate::run::live`].
+//! The C ABI. cbindgen generates `include/splatvk.h` from this folder; the work is done in
+//! [`crate::run::live`].
 //!
-//! Rules that hold for every function are in the header's introduction (`cbindgen.toml`). Structures begin with their
-//! size, so that hosts built against an older header go on working; fields are only ever added at the end, and numbers of
-//! retired codes are not used again.
-// C callers find the contract of the pointers in the header's introduction; repeating it on every function would hide what
-// is special about each.
+//! The header's introduction (`cbindgen.toml`) holds the rules of all functions. Structures begin
+//! with their size, so that hosts built against an older header keep working. Fields are only added
+//! at the end, and numbers of retired codes are not reused.
+// The contract of the pointers is in the header's introduction.
 #![allow(clippy::missing_safety_doc)]
 
 mod boundary;

@@ -1,4 +1,4 @@
-//! The host's progress callback behind [`Progress`].
+//! [`Progress`] that calls the host's callback.
 use super::types::*;
 use crate::progress::Progress;
 use crate::sync::lock;
@@ -6,11 +6,12 @@ use std::ffi::{CString, c_void};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+/// Progress callback of the host.
 pub struct Callback {
     call: SvkProgressFunction,
     user: *mut c_void,
     cancelled: AtomicBool,
-    /// Held during a call, so that there is never a second one.
+    /// Current stage; locked during a call, so that calls never overlap.
     stage: Mutex<StageProgress>,
 }
 
@@ -20,19 +21,19 @@ struct StageProgress {
     total: u64,
 }
 
-// SAFETY: `user` is only handed back to the host's function, which may be called from any thread, one at a time.
+// SAFETY: `user` is only passed back to the host's function, which any thread may call.
 unsafe impl Send for Callback {}
-// SAFETY: as above; the mutex keeps calls apart.
+// SAFETY: as above; the mutex serialises calls.
 unsafe impl Sync for Callback {}
 
-/// Texts of ours have no zero bytes; should one get in, it is left out.
+/// Converts a text to a C string without zero bytes.
 fn c_text(text: &str) -> CString {
     CString::new(text.replace('\0', "")).unwrap_or_default()
 }
 
 impl Callback {
     /// # Safety
-    /// The function may be called with `user` from any thread, one call at a time, until this is dropped.
+    /// `call` accepts `user` in any thread, one call at a time, until this is dropped.
     pub unsafe fn new(call: SvkProgressFunction, user: *mut c_void) -> Callback {
         Callback { call, user, cancelled: AtomicBool::new(false), stage: Mutex::default() }
     }

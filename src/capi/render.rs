@@ -12,9 +12,10 @@ use crate::scene::Camera;
 use crate::sync::lock;
 use std::collections::BTreeSet;
 
-/// Renders the scene from a camera into all `outputs` at once. `sync` may be NULL: then targets are written at once, and
-/// the call returns when they are. With a signal semaphore the call returns earlier; memory of the host is always written
-/// before it returns. Calls with one scene follow each other, and so do their writes. Thread-safe.
+/// Renders the scene from a camera into all `outputs`. Without a signal semaphore, or with `sync`
+/// NULL, the call returns when all outputs are written. With one it may return before buffers and
+/// images are written; memory of the host is always written before it returns. Calls with one scene
+/// are serialised, and so are their writes. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_render(
     scene: *mut SvkScene,
@@ -36,7 +37,8 @@ pub unsafe extern "C" fn svk_scene_render(
     })
 }
 
-/// Waits until everything that svk_scene_render was asked to write is written. Thread-safe.
+/// Waits until all buffers and images of earlier calls of svk_scene_render are written.
+/// Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_wait(scene: *mut SvkScene) -> SvkStatus {
     // SAFETY: per the header.
@@ -47,16 +49,17 @@ pub unsafe extern "C" fn svk_scene_wait(scene: *mut SvkScene) -> SvkStatus {
     })
 }
 
-/// An output that was checked.
+/// A checked output.
 struct RenderRequest {
-    what: RenderContent,
+    content: RenderContent,
     encoding: Encoding,
-    place: RenderDestination,
+    destination: RenderDestination,
 }
 
 enum RenderContent {
-    /// Of one of the scene's models.
+    /// Index of one of the scene's models, and a channel of its frame.
     Frame(usize, FrameChannel),
+    /// Text of the query.
     Relevancy(String),
 }
 
@@ -74,24 +77,22 @@ unsafe fn render(
     let mut live = lock(&scene.live);
     // SAFETY: per the header.
     let check = |(i, o): (usize, &SvkOutput)| unsafe { checked_request(&live, camera, o, i) };
-    let wanted = outputs.iter().enumerate().map(check).collect::<Result<Vec<_>, _>>()?;
-    let packed = pack_all(&mut live, camera, &wanted)?;
+    let requests = outputs.iter().enumerate().map(check).collect::<Result<Vec<_>, _>>()?;
+    let packed = pack_all(&mut live, camera, &requests)?;
     let mut copies = Vec::new();
-    for (buffer, wanted) in packed.into_iter().zip(&wanted) {
-        match wanted.place {
+    for (buffer, request) in packed.into_iter().zip(&requests) {
+        match request.destination {
             RenderDestination::Host(memory) => {
                 let bytes = buffer.cast::<u8>().read()?;
-                // SAFETY: `wanted` has checked that the host's memory is that long.
+                // SAFETY: `checked_request` has checked the length of the host's memory.
                 unsafe { std::ptr::copy_nonoverlapping(bytes.as_ptr(), memory, bytes.len()) };
             }
             RenderDestination::Device(target) => copies.push((buffer, target)),
         }
     }
-    let point =
-        |semaphore: u64, value: u64| (semaphore != 0).then(|| (vk::Semaphore::from_raw(semaphore), value));
     let sync = Sync {
-        wait: point(sync.wait_semaphore, sync.wait_value),
-        signal: point(sync.signal_semaphore, sync.signal_value),
+        wait: timeline_point(sync.wait_semaphore, sync.wait_value),
+        signal: timeline_point(sync.signal_semaphore, sync.signal_value),
     };
     if copies.is_empty() && sync.wait.is_none() && sync.signal.is_none() {
         return Ok(());
@@ -104,21 +105,26 @@ unsafe fn render(
     Ok(())
 }
 
-/// One buffer per output, of exactly its bytes.
+/// Semaphore with its value; `None` for a null handle.
+fn timeline_point(semaphore: u64, value: u64) -> Option<(vk::Semaphore, u64)> {
+    (semaphore != 0).then(|| (vk::Semaphore::from_raw(semaphore), value))
+}
+
+/// Renders all requests into one buffer each, of exactly its bytes.
 fn pack_all(
     live: &mut LiveScene,
     camera: &Camera,
-    wanted: &[RenderRequest],
+    requests: &[RenderRequest],
 ) -> Result<Vec<Buffer<u32>>, CallError> {
     let device = live.device().clone();
-    // Answers first: they render on their own where the camera is new, and the frame below must be the last one.
-    let mut packed: Vec<Option<Buffer<u32>>> = Vec::with_capacity(wanted.len());
-    for w in wanted {
-        packed.push(match &w.what {
+    // Queries come first: for a new camera they render a frame, and the frames below must be last.
+    let mut packed: Vec<Option<Buffer<u32>>> = Vec::with_capacity(requests.len());
+    for request in requests {
+        packed.push(match &request.content {
             RenderContent::Frame(..) => None,
             RenderContent::Relevancy(text) => {
                 let map = one_view(live.ask(text, camera)?)?.relevancy.data;
-                Some(match w.encoding {
+                Some(match request.encoding {
                     Encoding::F32x4 => {
                         let texels: Vec<[f32; 4]> = map.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();
                         device.buffer_from("relevancy", &texels)?.cast()
@@ -130,18 +136,18 @@ fn pack_all(
     }
     let pixels = camera.width as usize * camera.height as usize;
     let mut models = BTreeSet::new();
-    for (slot, w) in packed.iter_mut().zip(wanted) {
-        if let RenderContent::Frame(model, source) = w.what {
-            *slot = Some(pack::texels(&device, pixels, source, w.encoding)?);
+    for (slot, request) in packed.iter_mut().zip(requests) {
+        if let RenderContent::Frame(model, source) = request.content {
+            *slot = Some(pack::texels(&device, pixels, source, request.encoding)?);
             models.insert(model);
         }
     }
     for model in models {
         live.draw_bands(model, camera, |frame, band| {
-            for (slot, w) in packed.iter().zip(wanted) {
-                match (slot, &w.what) {
-                    (Some(texels), RenderContent::Frame(of, source)) if *of == model => {
-                        pack::pack(&device, frame, band, *source, w.encoding, texels)?;
+            for (slot, request) in packed.iter().zip(requests) {
+                match (slot, &request.content) {
+                    (Some(texels), RenderContent::Frame(index, source)) if *index == model => {
+                        pack::pack(&device, frame, band, *source, request.encoding, texels)?;
                     }
                     _ => {}
                 }
@@ -152,6 +158,7 @@ fn pack_all(
     Ok(packed.into_iter().flatten().collect())
 }
 
+/// Checks output `i`.
 unsafe fn checked_request(
     live: &LiveScene,
     camera: &Camera,
@@ -165,7 +172,7 @@ unsafe fn checked_request(
         3 => Encoding::Unorm8x4,
         other => return bad_argument(format!("output {i}: there is no encoding {other}")),
     };
-    let what = match o.channel {
+    let content = match o.channel {
         0 => RenderContent::Frame(SCENE_MODEL, FrameChannel::Colour),
         1 => RenderContent::Frame(SCENE_MODEL, FrameChannel::Alpha),
         2 => RenderContent::Frame(SCENE_MODEL, FrameChannel::Depth),
@@ -189,12 +196,12 @@ unsafe fn checked_request(
         },
         other => return bad_argument(format!("output {i}: there is no channel {other}")),
     };
-    let channels = match &what {
+    let channels = match &content {
         RenderContent::Frame(_, source) => source.channels(),
         RenderContent::Relevancy(_) => 1,
     };
     let bytes = encoding.bytes(channels, camera.width as usize * camera.height as usize);
-    let place = match (o.host.is_null(), o.buffer, o.image) {
+    let destination = match (o.host.is_null(), o.buffer, o.image) {
         (false, 0, 0) => RenderDestination::Host(o.host.cast::<u8>()),
         (true, buffer, 0) if buffer != 0 => {
             if !o.offset.is_multiple_of(4) {
@@ -210,9 +217,10 @@ unsafe fn checked_request(
     if o.image == 0 && o.bytes < bytes {
         return bad_argument(format!("output {i}: {bytes} bytes are needed, {} are there", o.bytes));
     }
-    Ok(RenderRequest { what, encoding, place })
+    Ok(RenderRequest { content, encoding, destination })
 }
 
+/// Checks the image of output `i`.
 fn image_target(
     o: &SvkOutput,
     i: usize,

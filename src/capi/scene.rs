@@ -1,4 +1,4 @@
-//! Scenes: loading, reading, asking, saving.
+//! Scenes: loading, reading, queries, saving.
 use super::boundary::{self, CallError, LastError, bad_argument, guard, guard_number};
 use super::context::SvkContext;
 use super::types::*;
@@ -18,7 +18,7 @@ use std::sync::Mutex;
 /// A trained or loaded scene.
 pub struct SvkScene {
     pub(super) live: Mutex<LiveScene>,
-    /// Copies to targets of the host that may still be under way.
+    /// Copies to buffers and images of the host that may be unfinished.
     pub(super) deliveries: Mutex<Vec<Delivery>>,
     pub(super) error: LastError,
 }
@@ -31,7 +31,7 @@ impl SvkScene {
     }
 }
 
-/// Runs a function of a scene.
+/// Runs the body of a function with a scene.
 unsafe fn with(scene: *const SvkScene, body: impl FnOnce(&SvkScene) -> Result<(), CallError>) -> SvkStatus {
     // SAFETY: per the header.
     match unsafe { scene.as_ref() } {
@@ -40,6 +40,7 @@ unsafe fn with(scene: *const SvkScene, body: impl FnOnce(&SvkScene) -> Result<()
     }
 }
 
+/// Reads and checks a camera of the host.
 pub(super) unsafe fn camera_in(pointer: *const SvkCamera) -> Result<Camera, CallError> {
     // SAFETY: per the header.
     let c = unsafe { boundary::read(pointer) }?;
@@ -63,8 +64,8 @@ pub(super) unsafe fn camera_in(pointer: *const SvkCamera) -> Result<Camera, Call
     camera.checked().map_err(|e| CallError::Error(Error::input(e)))
 }
 
-/// Loads a scene directory, or a file of Gaussians (which has no language). On failure `*scene` is NULL and the text is the
-/// context's. Thread-safe.
+/// Loads a scene directory, or a file of Gaussians, with the language file beside it if there is
+/// one. On failure `*scene` is NULL and the context keeps the error text. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_load(
     context: *mut SvkContext,
@@ -82,8 +83,8 @@ pub unsafe extern "C" fn svk_scene_load(
     })
 }
 
-/// Ends a scene, after waiting for what it still writes to buffers and images of the host. NULL is allowed. No other call
-/// with this scene may be running.
+/// Destroys a scene, after its unfinished writes to buffers and images of the host. NULL is
+/// allowed. No other call with this scene may be running.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_destroy(scene: *mut SvkScene) {
     if !scene.is_null() {
@@ -92,15 +93,16 @@ pub unsafe extern "C" fn svk_scene_destroy(scene: *mut SvkScene) {
     }
 }
 
-/// Copies the text of the last failed call with this scene (in any thread) into `text` (`bytes` long, always ended) and
-/// returns the bytes that it needs. Thread-safe.
+/// Copies the error text of the last failed call with this scene, in any thread, into `text` as
+/// svk_context_device_name does; returns the number of bytes that the whole text needs.
+/// Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_error(scene: *const SvkScene, text: *mut c_char, bytes: usize) -> usize {
     // SAFETY: per the header.
     guard_number(|| unsafe { scene.as_ref().map_or(0, |s| s.error.copy(text, bytes)) })
 }
 
-/// What the scene holds. Thread-safe.
+/// Fills `info` with the contents of the scene. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_info(scene: *const SvkScene, info: *mut SvkSceneInfo) -> SvkStatus {
     // SAFETY: per the header.
@@ -123,7 +125,8 @@ pub unsafe extern "C" fn svk_scene_info(scene: *const SvkScene, info: *mut SvkSc
     }
 }
 
-/// Camera `index` of the scene, and the name of its photo in `name` (`name_bytes` long; may be NULL). Thread-safe.
+/// Fills `camera` with camera `index` of the scene, and copies the name of its photo into `name`,
+/// which has `name_bytes` bytes and may be NULL. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_camera(
     scene: *const SvkScene,
@@ -157,7 +160,8 @@ pub unsafe extern "C" fn svk_scene_camera(
     }
 }
 
-/// Copies an array of the scene (SvkArray) into `values`, which must hold exactly `count` floats. Thread-safe.
+/// Copies an array of the scene into `values`. `array` is an SvkArray; `count` must be exactly the
+/// number of its floats. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_read(
     scene: *const SvkScene,
@@ -191,9 +195,10 @@ pub unsafe extern "C" fn svk_scene_read(
     }
 }
 
-/// Looks for a text in the view of a camera. `answer` is filled; `mask`, unless NULL, gets width × height bytes, 255 where
-/// the view shows what was asked for and 0 elsewhere, and `mask_bytes` is exactly that many. "Not found" is an answer, not
-/// a failure. Thread-safe; calls with one scene follow each other.
+/// Looks for a text in the view of a camera and fills `answer`. `mask` may be NULL; otherwise it
+/// receives width × height bytes, 255 where the view shows the thing and 0 elsewhere, and
+/// `mask_bytes` must be exactly that number. "Not found" is an answer, not a failure. Thread-safe;
+/// calls with one scene are serialised.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_query(
     scene: *mut SvkScene,
@@ -239,9 +244,10 @@ pub unsafe extern "C" fn svk_scene_query(
     }
 }
 
-/// The things in space that a text means, largest first, with the pixels at which the view of a camera shows them. `instances`
-/// has room for `capacity` structures, each with its size set (0 and NULL to count only); `*count` gets the number of things,
-/// which may be more. Thread-safe; calls with one scene follow each other.
+/// Fills `instances` with the things in space that a text means, largest first, and with their
+/// pixels in the view of a camera. It has room for `capacity` structures, each with its size set;
+/// NULL and 0 only count. `*count` receives the number of things, which may be larger. Thread-safe;
+/// calls with one scene are serialised.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_instances(
     scene: *mut SvkScene,
@@ -265,8 +271,10 @@ pub unsafe extern "C" fn svk_scene_instances(
     }
 }
 
-/// What is not understood of a text, one line each, into `notes` (`bytes` long, always ended): "answers for “mug”; “without
-/// handle” is not understood". Empty where all of it is understood. Thread-safe.
+/// Copies notes on the parts of a text that are not understood into `notes`, which has `bytes`
+/// bytes; one line each, truncated where they do not fit and always ended with a zero byte.
+/// Example: "answers for “mug”; “without handle” is not understood". Empty if the whole text is
+/// understood. Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_notes(
     scene: *mut SvkScene,
@@ -292,13 +300,13 @@ unsafe fn text_in(text: *const c_char) -> Result<String, CallError> {
     }
 }
 
-/// The view of an answer for one camera.
+/// Returns the single view of an answer for one camera.
 pub(super) fn one_view(answers: Answers) -> Result<QueryResult, CallError> {
     answers.views.into_iter().next().ok_or_else(|| Error::work("an answer without a view").into())
 }
 
-fn presence(of: Option<Presence>) -> SvkPresence {
-    match of {
+fn presence(presence: Option<Presence>) -> SvkPresence {
+    match presence {
         None => SvkPresence::Unknown,
         Some(Presence::Found) => SvkPresence::Found,
         Some(Presence::Unsure) => SvkPresence::Unsure,
@@ -306,30 +314,36 @@ fn presence(of: Option<Presence>) -> SvkPresence {
     }
 }
 
-fn instance(of: &Instance) -> SvkInstance {
-    let pixel = of.pixels.first().copied().flatten();
+/// Converts an instance with its pixel in the only view.
+fn instance(i: &Instance) -> SvkInstance {
+    let pixel = i.pixels.first().copied().flatten();
     let [x, y] = pixel.unwrap_or_default();
     SvkInstance {
         size: 0,
-        splats: of.splats.len() as u64,
-        share: of.share,
-        reliability: of.reliability.unwrap_or(-1.0),
-        centre: of.centre.to_array(),
-        box_min: of.bounds[0].to_array(),
-        box_max: of.bounds[1].to_array(),
-        axes: of.oriented.axes.map(|a| a.to_array()),
-        box_size: of.oriented.size.to_array(),
+        splats: i.splats.len() as u64,
+        share: i.share,
+        reliability: i.reliability.unwrap_or(-1.0),
+        centre: i.centre.to_array(),
+        box_min: i.bounds[0].to_array(),
+        box_max: i.bounds[1].to_array(),
+        axes: i.oriented.axes.map(|a| a.to_array()),
+        box_size: i.oriented.size.to_array(),
         seen: u64::from(pixel.is_some()),
         x,
         y,
     }
 }
 
-/// Writes the scene: a file of Gaussians where the name ends like one (.ply, .compressed.ply, .splat, .spz; language goes
-/// beside it, into NAME.language.npz), a scene directory where it has no ending, ends in a slash or is that of a folder; any other
-/// ending is SVK_STATUS_INPUT. It appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there, but
-/// never a symbolic link, what the scene was loaded from, a scene directory with files in it that splatvk did not write, or a place
-/// to which another process or thread writes. Thread-safe.
+/// Writes the scene to `path`.
+///
+/// A path that ends in .ply, .compressed.ply, .splat, .spz, .glb or .gltf becomes a file of
+/// Gaussians, with the language beside it in NAME.language.npz. A path without an ending, with a
+/// final slash, or of a folder becomes a scene directory. Any other ending is SVK_STATUS_INPUT.
+///
+/// The output appears complete or not at all. With `replace` = 1 it may replace a scene or a file,
+/// but never a symbolic link, the file or directory that the scene was loaded from, a scene
+/// directory with files of other programs, or the output of a running process or thread.
+/// Thread-safe.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_scene_save(
     scene: *mut SvkScene,
@@ -350,7 +364,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_camera_of_a_host_sees_by_the_rows_of_its_matrix() {
+    fn camera_in_reads_matrix_rows() {
         let given = SvkCamera {
             size: size_of::<SvkCamera>(),
             width: 80,
@@ -359,12 +373,12 @@ mod tests {
             fy: 26.0,
             cx: 40.0,
             cy: 30.0,
-            // A third of a turn: x, y and z of the camera are the world's y, z and x.
+            // The camera's x, y and z axes are the world's y, z and x axes.
             world_to_camera: [[0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 1.0, -2.0], [1.0, 0.0, 0.0, 3.0]],
         };
         // SAFETY: a whole structure.
         let camera = unsafe { camera_in(&given) }.ok().unwrap();
-        // (20 + 1, 30 − 2, 10 + 3) before the camera.
+        // In the camera's frame the point is (20 + 1, 30 − 2, 10 + 3).
         let (pixel, depth) = camera.project(DVec3::new(10.0, 20.0, 30.0));
         assert!(
             (depth - 13.0).abs() < 1e-12 && (pixel - glam::DVec2::new(61.0, 86.0)).length() < 1e-9,

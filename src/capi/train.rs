@@ -1,4 +1,4 @@
-//! Photos to a scene.
+//! Training of a scene from photos.
 use super::boundary::{self, CallError, bad_argument, guard};
 use super::context::SvkContext;
 use super::progress::Callback;
@@ -19,13 +19,14 @@ use crate::run::{
 use crate::scene::{Camera, GivenCamera, Image, MAX_PIXELS, RgbImage};
 use std::path::{Path, PathBuf};
 
-/// Most bytes from one row of a photo in memory to the next: a part of an image as wide as any may be given.
+/// Maximum distance of the rows of a photo in memory, bytes; a photo may be part of a wide image.
 const MOST_ROW_BYTES: u64 = 1 << 32;
-/// Most bytes of a photo's file: an uncompressed one of the most pixels, in 32-bit floats.
+/// Maximum of bytes of a photo's file: as uncompressed 32-bit floats of the most pixels.
 const MOST_ENCODED_BYTES: u64 = 16 * MAX_PIXELS;
 
-/// Trains a scene from 2 to 16 photos. `options` may be NULL. On failure, and when the callback stops it, `*scene` is NULL
-/// and the text is the context's. Thread-safe; several trainings may run on one context, sharing its device.
+/// Trains a scene from 2 to 16 photos. `options` may be NULL. On failure, and when the callback
+/// stops it, `*scene` is NULL and the context keeps the error text. Thread-safe; several trainings
+/// may run on one context and share its device.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_train(
     context: *mut SvkContext,
@@ -42,7 +43,7 @@ pub unsafe extern "C" fn svk_train(
             let slot = boundary::slot(scene)?;
             let options = boundary::read_or_default(options)?;
             let given = boundary::read_array(photos, photo_count)?;
-            // What is wrong with the options is said before the photos are read.
+            // Options are checked before the photos are read.
             let networks = inventory(&context.registry);
             let config = config(&options, &networks)?;
             let progress = Callback::new(options.progress, options.user);
@@ -70,7 +71,7 @@ pub unsafe extern "C" fn svk_train(
     })
 }
 
-/// The photos, and their cameras where they were given.
+/// Reads the photos, and their cameras where they are given.
 unsafe fn gather(
     given: &[SvkPhoto],
     views: usize,
@@ -94,11 +95,11 @@ unsafe fn gather(
         photo::load_each(&chosen, max_size, progress)?
     } else {
         // SAFETY: photos of the host, as the header describes them.
-        let one = |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe {
-            single(photo, path, i, max_size)
+        let read = |(i, (photo, path)): (usize, (&SvkPhoto, Option<PathBuf>))| unsafe {
+            read_photo(photo, path, i, max_size)
         };
         let mut photos =
-            given.iter().zip(paths).enumerate().map(one).collect::<Result<Vec<_>, CallError>>()?;
+            given.iter().zip(paths).enumerate().map(read).collect::<Result<Vec<_>, CallError>>()?;
         photo::settle(&mut photos, &[], progress);
         photos
     };
@@ -113,7 +114,8 @@ unsafe fn gather(
     Ok((photos, cameras))
 }
 
-unsafe fn single(
+/// Reads one photo from its file, its file in memory, or its pixels.
+unsafe fn read_photo(
     given: &SvkPhoto,
     path: Option<PathBuf>,
     index: usize,
@@ -148,40 +150,41 @@ unsafe fn single(
     if given.mask.is_null() {
         return Ok(photo::from_pixels(&name, &image, focal, max_size)?);
     }
-    // SAFETY: a byte for each of the pixels, whose number has been checked.
+    // SAFETY: one byte for each of the pixels, whose number was checked.
     let mask = unsafe { std::slice::from_raw_parts(given.mask, image.data.len()) };
     let used = mask.iter().map(|v| *v > 0).collect();
     let used = Image { width: image.width, height: image.height, data: used };
     Ok(photo::from_used_pixels(&name, &image, &used, focal, max_size)?)
 }
 
+/// Reads the pixels of a photo in memory.
 unsafe fn pixels(given: &SvkPhoto, name: &Path) -> Result<RgbImage, CallError> {
     let (width, height, bytes) = (given.width as usize, given.height as usize, given.pixel_bytes as usize);
-    let named = |what: String| bad_argument(format!("{}: {what}", name.display()));
+    let refuse = |reason: String| bad_argument(format!("{}: {reason}", name.display()));
     if u64::from(given.width) * u64::from(given.height) > MAX_PIXELS {
         let most = MAX_PIXELS / 1_000_000;
-        return named(format!("{width} × {height} pixels are too many; at most {most} million"));
+        return refuse(format!("{width} × {height} pixels are too many; at most {most} million"));
     }
     let packed = width.saturating_mul(bytes);
     let row = if given.row_bytes == 0 { packed } else { given.row_bytes };
-    let whole = (3..=4).contains(&bytes) && width > 0 && height > 0;
-    if !whole || row < packed || row as u64 > MOST_ROW_BYTES {
-        return named(format!(
+    let is_image = (3..=4).contains(&bytes) && width > 0 && height > 0;
+    if !is_image || row < packed || row as u64 > MOST_ROW_BYTES {
+        return refuse(format!(
             "{width} × {height} pixels of {bytes} bytes in rows of {row} bytes make no image"
         ));
     }
     let length = row.checked_mul(height - 1).and_then(|rows| rows.checked_add(packed));
     let Some(length) = length.filter(|n| isize::try_from(*n).is_ok()) else {
-        return named(format!("{height} rows of {row} bytes do not fit into memory"));
+        return refuse(format!("{height} rows of {row} bytes do not fit into memory"));
     };
-    // SAFETY: the last row need not reach to the next one.
+    // SAFETY: the caller's rows; the last one ends with its last pixel.
     let all = unsafe { std::slice::from_raw_parts(given.pixels, length) };
-    let level = |v: u8| f32::from(v) / 255.0;
-    let pixel = |p: &[u8]| [level(p[0]), level(p[1]), level(p[2])];
+    let pixel = |p: &[u8]| [p[0], p[1], p[2]].map(|v| f32::from(v) / 255.0);
     let data = all.chunks(row).flat_map(|r| r[..packed].chunks_exact(bytes).map(pixel)).collect();
     Ok(RgbImage { width, height, data })
 }
 
+/// Converts training options to a resolved configuration.
 unsafe fn config(o: &SvkTrainOptions, networks: &Inventory) -> Result<ReconstructionConfig, CallError> {
     let preset = match o.preset {
         0 => None,
@@ -236,7 +239,7 @@ unsafe fn config(o: &SvkTrainOptions, networks: &Inventory) -> Result<Reconstruc
     Ok(config.resolved(networks)?)
 }
 
-/// A source by its name, or by the file or folder that an older field holds, or the built-in one.
+/// Source by name, by the file or folder of an older field, or the built-in one.
 fn source<K: SourceKind>(
     named: Option<String>,
     given: Option<SourceChoice>,
@@ -256,8 +259,8 @@ mod tests {
     use crate::progress::Silent;
 
     #[test]
-    fn what_lies_between_the_rows_of_a_photo_in_memory_is_skipped() {
-        // Two rows of two pixels, 8 bytes apart; the second one ends with its last pixel.
+    fn pixels_skips_row_padding() {
+        // Two rows of two pixels at a distance of 8 bytes; the second ends with its last pixel.
         let bytes: [u8; 14] = [1, 2, 3, 4, 5, 6, 99, 99, 7, 8, 9, 10, 11, 12];
         // SAFETY: zero is a value.
         let none: SvkPhoto = unsafe { std::mem::zeroed() };
@@ -271,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn mask_of_pixels_leaves_the_others() {
+    fn mask_excludes_zero_pixels() {
         let (grey, mut mask) = (vec![90u8; 3 * 64 * 64], vec![255u8; 64 * 64]);
         mask[..64 * 10].fill(0);
         // SAFETY: zero is a value.
@@ -279,7 +282,7 @@ mod tests {
         let size = SvkPhoto { pixel_bytes: 3, width: 64, height: 64, mask: mask.as_ptr(), ..none };
         let given = SvkPhoto { pixels: grey.as_ptr(), ..size };
         // SAFETY: pixels and mask live as long as the call.
-        let photo = unsafe { single(&given, None, 0, 64) }.ok().unwrap();
+        let photo = unsafe { read_photo(&given, None, 0, 64) }.ok().unwrap();
         assert!(!photo.uses(9 * 64 + 63) && photo.uses(10 * 64));
         let encoded = SvkPhoto { encoded: grey.as_ptr(), encoded_bytes: 9, ..size };
         // SAFETY: refused before anything is read.
@@ -287,11 +290,11 @@ mod tests {
     }
 
     #[test]
-    fn sizes_that_are_none_are_refused_unread() {
+    fn invalid_sizes_are_refused_unread() {
         // SAFETY: zero is a value.
         let none: SvkPhoto = unsafe { std::mem::zeroed() };
         let byte = 0u8;
-        for (width, height, row_bytes, says) in [
+        for (width, height, row_bytes, reason) in [
             (30_000, 30_000, 0, "too many; at most"),
             (u32::MAX, u32::MAX, 0, "too many; at most"),
             (u32::MAX, 0, 0, "make no image"),
@@ -302,14 +305,14 @@ mod tests {
         ] {
             let given = SvkPhoto { pixels: &byte, pixel_bytes: 4, width, height, row_bytes, ..none };
             // SAFETY: refused before the pixels are read.
-            let said = match unsafe { pixels(&given, Path::new("a")) } {
+            let message = match unsafe { pixels(&given, Path::new("a")) } {
                 Err(CallError::Argument(text)) => text,
                 _ => panic!("{width} {height} {row_bytes}"),
             };
-            assert!(said.starts_with("a: ") && said.contains(says), "{said}");
+            assert!(message.starts_with("a: ") && message.contains(reason), "{message}");
         }
         let given = SvkPhoto { encoded: &byte, encoded_bytes: usize::MAX, ..none };
         // SAFETY: as above.
-        assert!(matches!(unsafe { single(&given, None, 0, 64) }, Err(CallError::Argument(_))));
+        assert!(matches!(unsafe { read_photo(&given, None, 0, 64) }, Err(CallError::Argument(_))));
     }
 }

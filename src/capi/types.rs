@@ -1,28 +1,29 @@
-//! Numbers and structures that cross the boundary.
+//! Enumerations and structures of the C interface.
 use std::ffi::{c_char, c_void};
 
-/// What a function returns. Anything but `SVK_STATUS_OK` leaves a text behind: svk_context_error,
-/// svk_scene_error.
+/// Result of a function. After any other status than SVK_STATUS_OK, svk_context_error or
+/// svk_scene_error returns a text.
 #[repr(i32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkStatus {
-    /// Done.
+    /// Success.
     Ok = 0,
-    /// What was given cannot be used; the text says what and why.
+    /// The input cannot be used; the text names it and the reason.
     Input = 1,
     /// A file could not be read.
     Io = 2,
     /// A library or program is not installed.
     Missing = 3,
-    /// The Vulkan device or driver refused something, other than the codes from 9 on.
+    /// An error of the Vulkan device or driver without a code of its own (9 to 11).
     Gpu = 4,
-    /// Something failed while working on valid input.
+    /// Work on valid input failed.
     Work = 5,
-    /// The progress callback asked to stop; nothing was made or written.
+    /// The progress callback stopped the work; nothing was made or written.
     Cancelled = 6,
-    /// A pointer is null or a structure's size is wrong: a mistake in the calling program.
+    /// An argument is invalid, such as a null pointer or a wrong structure size: an error of the
+    /// calling program.
     Argument = 7,
-    /// A mistake in splatvk. The handle may be destroyed, and nothing else should be done with it.
+    /// An error in splatvk. The handle can only be destroyed.
     Internal = 8,
     /// The Vulkan device was lost. Contexts and scenes on it can only be destroyed; a context on a
     /// new device may work.
@@ -30,90 +31,91 @@ pub enum SvkStatus {
     /// The Vulkan device has no memory left: fewer splats, smaller photos or another device may
     /// help.
     OutOfDeviceMemory = 10,
-    /// No Vulkan loader, driver or device that can be used.
+    /// There is no usable Vulkan loader, driver or device.
     NoDevice = 11,
-    /// A model, or a file of it, is missing or not what it is used for.
+    /// A model, or a file of it, is missing or unsuitable.
     MissingModel = 12,
-    /// A file cannot be written: the disk is full, or the folder does not allow it. Nothing
-    /// half-written stays.
+    /// A file cannot be written: the disk is full, or the folder is not writable. No partial file
+    /// remains.
     Unwritable = 13,
 }
 
-/// Time against quality.
+/// Trade-off between time and quality.
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkPreset {
-    /// Draft on a CPU device, default on a GPU.
+    /// SVK_PRESET_DRAFT on a CPU device, SVK_PRESET_DEFAULT on a GPU.
     Auto = 0,
-    /// Minutes on a 2-core CPU.
+    /// Takes minutes on a 2-core CPU.
     Draft = 1,
     /// Best quality for the time on a GPU.
     Default = 2,
-    /// The paper's schedule and constants.
+    /// Schedule and constants of the paper.
     Paper = 3,
 }
 
-/// Spherical-harmonics degree of colours: above 0 they depend on the direction.
+/// Degree of the spherical harmonics of colours; above 0 colours depend on the viewing direction.
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkShDegree {
-    /// What photos support that are left out for a test.
+    /// The highest degree that improves photos left out of the fit.
     Auto = 0,
-    /// The same from everywhere.
+    /// The same colour from all directions.
     Zero = 1,
-    /// 4 numbers per colour channel.
+    /// 4 coefficients per colour channel.
     One = 2,
-    /// 9.
+    /// 9 coefficients per colour channel.
     Two = 3,
-    /// 16.
+    /// 16 coefficients per colour channel.
     Three = 4,
 }
 
-/// What a call of the progress callback is about.
+/// Kind of a call of the progress callback.
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkProgressKind {
     /// A stage begins.
     Begin = 0,
-    /// `done` of its `total` steps are finished.
+    /// `done` of the `total` steps of the stage are finished.
     Step = 1,
-    /// It is over.
+    /// The stage ends.
     End = 2,
     /// `note` is a warning for the user.
     Warning = 3,
 }
 
-/// What to render.
+/// Rendered channel.
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkChannel {
-    /// 4 values: red, green, blue on black (display-referred sRGB values, not clamped in floats),
-    /// and alpha.
+    /// 4 values: red, green and blue on black, as display-referred sRGB values (not clamped in
+    /// floats), and alpha.
     Colour = 0,
     /// 1 value: accumulated opacity, 0 to 1.
     Alpha = 1,
-    /// 1 value: expected camera z in scene units, 0 where alpha is below a half.
+    /// 1 value: expected camera z in scene units; 0 where alpha is below a half.
     Depth = 2,
-    /// The blended features of one level: as many values as SvkSceneInfo.feature_dim says for it.
+    /// Blended features of one level: SvkSceneInfo.feature_dim values.
     Features = 3,
-    /// 1 value: how well the pixel answers `text`, 0 to 1, smoothed; 0 where the scene says
-    /// nothing.
+    /// 1 value: smoothed relevancy of the pixel to `text`, 0 to 1; 0 where the view is empty.
     Relevancy = 4,
 }
 
-/// How values are stored. Rows go from top to bottom, without gaps.
+/// Memory layout of values. Rows go from top to bottom, without gaps.
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkEncoding {
     /// 32-bit floats [height][width][values]. As an image: VK_FORMAT_R32_SFLOAT for 1 value,
     /// VK_FORMAT_R32G32B32A32_SFLOAT for 4; other counts are for memory and buffers only.
     F32 = 0,
-    /// 32-bit floats [ceil(values / 4)][height][width][4], filled up with zeros. As an image:
-    /// VK_FORMAT_R32G32B32A32_SFLOAT with one array layer for every 4 values.
+    /// 32-bit floats [ceil(values / 4)][height][width][4], padded with zeros. As an image:
+    /// VK_FORMAT_R32G32B32A32_SFLOAT with one array layer per 4 values.
     F32X4 = 1,
-    /// The same in 16-bit floats: VK_FORMAT_R16G16B16A16_SFLOAT. Not for relevancy.
+    /// 16-bit floats, otherwise as SVK_ENCODING_F32X4. As an image: VK_FORMAT_R16G16B16A16_SFLOAT.
+    /// Not for relevancy.
     F16X4 = 2,
-    /// The same in 8 bits, values clamped to [0, 1]: VK_FORMAT_R8G8B8A8_UNORM. Not for relevancy.
+    /// 8 bits, values clamped to [0, 1], otherwise as SVK_ENCODING_F32X4. As an image:
+    /// VK_FORMAT_R8G8B8A8_UNORM. Not for relevancy.
     Unorm8X4 = 3,
 }
 
@@ -121,8 +123,8 @@ pub enum SvkEncoding {
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkArray {
-    /// [N][3] centres, scene units; axes as the cameras' (x right, y down, z forward in a camera
-    /// without rotation).
+    /// [N][3] centres in scene units; the axes are x right, y down, z forward of a camera without
+    /// rotation.
     Means = 0,
     /// [N][3] natural logarithms of the standard deviations along the local axes.
     LogScales = 1,
@@ -133,42 +135,42 @@ pub enum SvkArray {
     /// [N][(degree + 1)²][3] spherical-harmonics coefficients; colour = 0.5 + 0.2820948 · the
     /// first.
     Sh = 4,
-    /// [N] pixels of all photos that show the Gaussian; below 0.05 no photo does and it is guessed.
-    /// Empty (0 floats) where that is not known: files of Gaussians, scenes of older versions.
+    /// [N] numbers of pixels, over all photos, that show the Gaussian. Below 0.05 no photo shows
+    /// it, and it is extrapolated. Empty (0 floats) where this is unknown: files of Gaussians,
+    /// scenes of older versions.
     Seen = 5,
 }
 
-/// Whether the scene has what a text means.
+/// Presence in the scene of the thing that a text means.
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkPresence {
-    /// The text model knows too few texts to tell.
+    /// The text model has too few other texts to compare with.
     Unknown = 0,
-    /// It has.
+    /// The thing is in the scene.
     Found = 1,
-    /// What the scene's features say does not decide, or the text is not wholly understood (see
-    /// svk_scene_notes).
+    /// The features do not decide, or a part of the text is not understood (see svk_scene_notes).
     Unsure = 2,
-    /// It has not.
+    /// The thing is not in the scene.
     Absent = 3,
 }
 
-/// How a context is made. All zero (but for `size`) is the default.
+/// Options of a context. Zero is the default of every field but `size`.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkContextOptions {
     /// sizeof(SvkContextOptions)
     pub size: usize,
-    /// Part of a Vulkan device's name, or its number as a text; NULL = the best one. Not for
-    /// svk_context_adopt.
+    /// Part of the name of a Vulkan device, or its number as a text; NULL = the best device. Not
+    /// for svk_context_adopt.
     pub device: *const c_char,
     /// Folder of the models; NULL = the installed ones.
     pub models: *const c_char,
-    /// 1 = training gives the same bits on every run on one device, about a tenth slower.
+    /// 1 = training gives the same bits in every run on one device, about a tenth slower.
     pub deterministic: u32,
-    /// 1 = with the Khronos validation layer. Not for svk_context_adopt.
+    /// 1 = enable the Khronos validation layer. Not for svk_context_adopt.
     pub validation: u32,
-    /// What computes the networks, as --provider takes it; NULL = the environment variable
+    /// Provider that computes the networks, as of --provider; NULL = the environment variable
     /// SPLATVK_PROVIDER, or else "auto".
     pub provider: *const c_char,
 }
@@ -176,64 +178,64 @@ pub struct SvkContextOptions {
 /// A pointer to vkGetInstanceProcAddr, cast to this type.
 pub type SvkVoidFunction = Option<unsafe extern "C" fn()>;
 
-/// Takes or releases the host's own lock of a queue; `user` is the structure's.
+/// Locks or unlocks a queue of the host; `user` is SvkVulkanDevice.user.
 pub type SvkQueueFunction = Option<unsafe extern "C" fn(user: *mut c_void)>;
 
-/// A Vulkan device of the host, for svk_context_adopt. It must outlive the context and all scenes
-/// made from it.
+/// A Vulkan device of the host, for svk_context_adopt. It must outlive the context and all its
+/// scenes.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkVulkanDevice {
     /// sizeof(SvkVulkanDevice)
     pub size: usize,
-    /// VkInstance made with apiVersion 1.2 or newer.
+    /// VkInstance, created with apiVersion 1.2 or newer.
     pub instance: *mut c_void,
     /// VkPhysicalDevice
     pub physical_device: *mut c_void,
-    /// VkDevice made with the feature synchronization2 (of Vulkan 1.3 or VK_KHR_synchronization2).
+    /// VkDevice, created with the feature synchronization2 (of Vulkan 1.3 or
+    /// VK_KHR_synchronization2).
     pub device: *mut c_void,
-    /// VkQueue with compute.
+    /// VkQueue that supports compute.
     pub queue: *mut c_void,
-    /// Its family.
+    /// Queue family of `queue`.
     pub queue_family: u32,
     /// Number of `extensions`.
     pub extension_count: u32,
-    /// Names of the device extensions that were enabled.
+    /// Names of the enabled device extensions.
     pub extensions: *const *const c_char,
-    /// The VkPhysicalDeviceFeatures2 chain that the device was made with. Each feature of this list
-    /// that is on makes some work faster: shaderInt64, storageBuffer16BitAccess,
-    /// subgroupSizeControl, computeFullSubgroups, shaderBufferFloat32AtomicAdd. timelineSemaphore
-    /// is needed for SvkSync. Read during the call only.
+    /// VkPhysicalDeviceFeatures2 chain of the device's creation. Some work is faster with each of
+    /// these features: shaderInt64, storageBuffer16BitAccess, subgroupSizeControl,
+    /// computeFullSubgroups, shaderBufferFloat32AtomicAdd. SvkSync needs timelineSemaphore. Read
+    /// during the call only.
     pub features: *const c_void,
     /// vkGetInstanceProcAddr of the host; NULL = that of the system's loader.
     pub get_instance_proc_addr: SvkVoidFunction,
-    /// Called around every use of the queue. NULL = the host leaves the queue alone while a call
-    /// with this context or one of its scenes runs.
+    /// Called before every use of the queue. NULL = the host does not use the queue during calls
+    /// with this context or one of its scenes.
     pub lock_queue: SvkQueueFunction,
-    /// The end of `lock_queue`.
+    /// Called after every use of the queue; set if and only if `lock_queue` is.
     pub unlock_queue: SvkQueueFunction,
-    /// Given to both.
+    /// Argument of `lock_queue` and `unlock_queue`.
     pub user: *mut c_void,
 }
 
-/// A pinhole camera. Axes: x right, y down, z forward. The centre of the first pixel is at (0.5,
-/// 0.5).
+/// A pinhole camera. Axes: x right, y down, z forward. The first pixel's centre is (0.5, 0.5).
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkCamera {
     /// sizeof(SvkCamera)
     pub size: usize,
-    /// Pixels.
+    /// Width of the image, pixels.
     pub width: u32,
-    /// Pixels.
+    /// Height of the image, pixels.
     pub height: u32,
     /// Focal length along x, pixels.
     pub fx: f64,
     /// Focal length along y, pixels.
     pub fy: f64,
-    /// Principal point, pixels.
+    /// Principal point along x, pixels.
     pub cx: f64,
-    /// Principal point, pixels.
+    /// Principal point along y, pixels.
     pub cy: f64,
     /// Rows of [R | t]: camera = R · world + t.
     pub world_to_camera: [[f64; 4]; 3],
@@ -245,37 +247,36 @@ pub struct SvkCamera {
 pub struct SvkPhoto {
     /// sizeof(SvkPhoto)
     pub size: usize,
-    /// File name for messages, masks and cameras; NULL = that of `path`, or "photo_00", "photo_01",
+    /// File name in messages, masks and cameras; NULL = that of `path`, or "photo_00", "photo_01",
     /// ...
     pub name: *const c_char,
-    /// Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF); with SvkTrainOptions.views a folder of them,
-    /// too.
+    /// Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF), or a folder of image files.
     pub path: *const c_char,
-    /// Such an image file in memory.
+    /// Content of an image file.
     pub encoded: *const u8,
-    /// Its length in bytes.
+    /// Length of `encoded`, bytes.
     pub encoded_bytes: usize,
-    /// Upright 8-bit sRGB pixels, 3 or 4 bytes each; a fourth byte is skipped.
+    /// Upright 8-bit sRGB pixels of 3 or 4 bytes; the fourth byte is ignored.
     pub pixels: *const u8,
-    /// Bytes of a pixel: 3 or 4.
+    /// Bytes per pixel of `pixels`: 3 or 4.
     pub pixel_bytes: u32,
-    /// Pixels.
+    /// Width of `pixels`.
     pub width: u32,
-    /// Pixels.
+    /// Height of `pixels`.
     pub height: u32,
-    /// From one row to the next, bytes; 0 = width * pixel_bytes.
+    /// Distance of the rows of `pixels`, bytes; 0 = width * pixel_bytes.
     pub row_bytes: usize,
-    /// Focal length in these pixels, where it is known; 0 = unknown. For `pixels`; files tell it
-    /// themselves.
+    /// Focal length of `pixels`, in pixels; 0 = unknown. Image files state their own.
     pub focal: f64,
-    /// The photo's camera, where it is known; for all photos or for none.
+    /// Camera of the photo; NULL = unknown. For all photos or for none.
     pub camera: *const SvkCamera,
-    /// For `pixels`: a byte for each, 0 where the pixel is not used (a person, a bonnet), rows
-    /// packed; NULL = all are used. Files have masks in a folder "masks" beside theirs.
+    /// One byte for each of `pixels`, without gaps between rows: 0 = the pixel is not used (a
+    /// person, a bonnet). NULL = all are used. Image files have masks in a folder "masks" beside
+    /// them.
     pub mask: *const u8,
 }
 
-/// What the progress callback is told. Texts are valid during the call only.
+/// Argument of the progress callback. Texts are valid during the call only.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkProgress {
@@ -285,21 +286,21 @@ pub struct SvkProgress {
     pub kind: u32,
     /// Name of the stage.
     pub stage: *const c_char,
-    /// Steps finished.
+    /// Number of finished steps.
     pub done: u64,
-    /// Steps in all; 0 = unknown.
+    /// Number of all steps; 0 = unknown.
     pub total: u64,
-    /// A short live figure ("PSNR 28.1"), or the warning.
+    /// A short figure ("PSNR 28.1"), or the warning.
     pub note: *const c_char,
 }
 
-/// Called from any thread, never by two at a time, and never after svk_train has returned. Anything
-/// but 0 asks it to stop. No exception may leave it, and it may not call into the context that
-/// trains.
+/// Progress callback. It is called from any thread, but never from two at a time, and not after
+/// svk_train returns. A result other than 0 stops the training. It must not throw an exception or
+/// call functions with the context that trains.
 pub type SvkProgressFunction =
     Option<unsafe extern "C" fn(user: *mut c_void, progress: *const SvkProgress) -> i32>;
 
-/// How a scene is trained. All zero (but for `size`) is the default: built-in models, preset by
+/// Options of training. Zero is the default of every field but `size`: built-in models, preset by
 /// device.
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -308,56 +309,56 @@ pub struct SvkTrainOptions {
     pub size: usize,
     /// SvkPreset
     pub preset: u32,
-    /// How many photos to use where a folder is given; 0 = all that are given.
+    /// Number of photos to choose of files and folders; 0 = all files, or at most 4 where a folder
+    /// is given.
     pub views: u32,
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     pub seed: u64,
     /// Steps of the colour stage; 0 = the preset's.
     pub iterations: u64,
     /// Steps of the language stage; 0 = the preset's.
     pub language_iterations: u64,
-    /// Length of the codes that splats carry: 3, 8 or 16; 0 = 16.
+    /// Length of the codes of splats: 3, 8 or 16; 0 = 16.
     pub feature_dim: u32,
-    /// 1 = one model per level, as in the paper.
+    /// 1 = one set of splats per level, as in the paper.
     pub per_level: u32,
-    /// Known cameras: transforms.json, a COLMAP model folder or cameras.json; NULL = found from the
-    /// photos.
+    /// Known cameras: transforms.json, a COLMAP model folder or cameras.json; NULL = estimated from
+    /// the photos.
     pub cameras: *const c_char,
     /// Folder of precomputed masks (STEM_s.npy); NULL = built-in.
     pub masks: *const c_char,
     /// Folder of precomputed features (STEM_f.npy, text_embeddings.npz), the same as `masks`; NULL
     /// = built-in.
     pub features: *const c_char,
-    /// Called with the progress; a result other than 0 stops the run; may be NULL.
+    /// Progress callback; may be NULL.
     pub progress: SvkProgressFunction,
-    /// Given to `progress`.
+    /// First argument of `progress`.
     pub user: *mut c_void,
-    /// Longer side of the working images, pixels: larger photos are scaled down, none is enlarged.
-    /// 0 = 800 on a CPU device, 1600 on a GPU.
+    /// Longer side of the working images, pixels: larger photos are scaled down, smaller ones are
+    /// not enlarged. 0 = 800 on a CPU device, 1600 on a GPU.
     pub max_size: u64,
-    /// Cameras and points, as `splatvk run --init` takes it: "sfm", "cameras:FILE", the name of an
-    /// installed network, or "auto" for the best of them. NULL = `cameras`, or else "sfm".
+    /// Source of cameras and points, as of `splatvk run --init`: "sfm", "cameras:FILE", the name of
+    /// an installed network, or "auto" for the best of them. NULL = `cameras`, or else "sfm".
     pub init: *const c_char,
-    /// Dense matches, as --matcher takes it. NULL = built-in.
+    /// Source of dense matches, as of --matcher. NULL = built-in.
     pub matcher: *const c_char,
-    /// Masks, as --masks takes it. NULL = `masks`, or else built-in.
+    /// Source of masks, as of --masks. NULL = `masks`, or else built-in.
     pub mask_source: *const c_char,
-    /// Region features, as --features takes it. NULL = `features`, or else built-in.
+    /// Source of region features, as of --features. NULL = `features`, or else built-in.
     pub feature_source: *const c_char,
-    /// How language gets onto the splats, as --method takes it. NULL = "lift"; "sparselgs" with the
-    /// preset of the paper, `language_iterations`, `per_level` or `compat`.
+    /// Method of the language stage, as of --method. NULL = "lift", or "sparselgs" with
+    /// SVK_PRESET_PAPER, `language_iterations`, `per_level` or `compat`.
     pub method: *const c_char,
     /// SvkShDegree
     pub sh_degree: u64,
-    /// What can be done in several ways, as others do it: as --compat takes it. NULL = as this
-    /// library does it.
+    /// Implementation whose choices are reproduced, as of --compat. NULL = none.
     pub compat: *const c_char,
-    /// Depth suggested where photos cannot be matched, as --depth-prior takes it: "dir:FOLDER", the
-    /// name of an installed network, or "auto" for the best of them. NULL = none.
+    /// Source of depth where photos cannot be matched, as of --depth-prior: "dir:FOLDER", the name
+    /// of an installed network, or "auto" for the best of them. NULL = none.
     pub depth_prior: *const c_char,
 }
 
-/// What a scene holds.
+/// Contents of a scene.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkSceneInfo {
@@ -365,19 +366,19 @@ pub struct SvkSceneInfo {
     pub size: usize,
     /// Number of Gaussians.
     pub splats: u64,
-    /// Degree of their spherical harmonics, 0 to 3.
+    /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: u32,
-    /// Number of cameras; 0 for a bare file of Gaussians.
+    /// Number of cameras; 0 for a file of Gaussians.
     pub cameras: u32,
-    /// Codes per level: subparts, parts, wholes. All 0 = no language.
+    /// Number of codes per level: subparts, parts, wholes. All 0 = no language.
     pub codes: [u32; 3],
-    /// Feature values per level.
+    /// Length of the features per level.
     pub feature_dim: [u32; 3],
-    /// Metres in a scene unit; 0 = unknown.
+    /// Metres per scene unit; 0 = unknown.
     pub metres_per_unit: f64,
 }
 
-/// Where an image of the host is written: exactly one of `host`, `buffer` and `image` is set.
+/// Destination of a rendered channel: exactly one of `host`, `buffer` and `image` is set.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkOutput {
@@ -391,101 +392,100 @@ pub struct SvkOutput {
     pub level: u32,
     /// Number of array layers of `image`.
     pub layers: u32,
-    /// For relevancy: what to look for, UTF-8.
+    /// For relevancy: text of the query, UTF-8.
     pub text: *const c_char,
     /// Memory of the host.
     pub host: *mut c_void,
-    /// Size of `host`, or of the space in `buffer` from `offset` on. Must hold what the encoding
-    /// needs.
+    /// Size of `host`, or of `buffer` from `offset` on, bytes; at least the size of the encoding.
     pub bytes: usize,
     /// VkBuffer with VK_BUFFER_USAGE_TRANSFER_DST_BIT, on the host's device.
     pub buffer: u64,
-    /// First byte of `buffer`; a multiple of 4.
+    /// Offset in `buffer`, bytes; a multiple of 4.
     pub offset: u64,
     /// VkImage with VK_IMAGE_USAGE_TRANSFER_DST_BIT, on the host's device: 2D, of the camera's
-    /// size, one sample, in the format that the encoding names. Mip level 0 is written.
+    /// size, one sample, in the format of the encoding. Mip level 0 is written.
     pub image: u64,
-    /// VkImageLayout that the image has; VK_IMAGE_LAYOUT_UNDEFINED where its content may be lost.
+    /// VkImageLayout of the image before the write; VK_IMAGE_LAYOUT_UNDEFINED discards its content.
     pub old_layout: u32,
-    /// VkImageLayout that it gets; not VK_IMAGE_LAYOUT_UNDEFINED.
+    /// VkImageLayout of the image after the write; not VK_IMAGE_LAYOUT_UNDEFINED.
     pub new_layout: u32,
 }
 
-/// Timeline semaphores of the host around writing to its buffers and images. Both belong to the
-/// context's queue family (or are shared concurrently) when the wait is over, and still do when the
-/// signal comes.
+/// Timeline semaphores of the host for writes to its buffers and images. From the wait to the
+/// signal these buffers and images must belong to the context's queue family or be shared
+/// concurrently.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkSync {
     /// sizeof(SvkSync)
     pub size: usize,
-    /// VkSemaphore of type timeline: targets may be written once it reaches `wait_value`; 0 = at
-    /// once.
+    /// VkSemaphore of type timeline: writes begin once it reaches `wait_value`; 0 = at once.
     pub wait_semaphore: u64,
-    /// See `wait_semaphore`.
+    /// Value of `wait_semaphore`.
     pub wait_value: u64,
-    /// VkSemaphore of type timeline: reaches `signal_value` when all targets are written. 0 = the
-    /// call waits for that.
+    /// VkSemaphore of type timeline: it reaches `signal_value` when all writes are finished; 0 =
+    /// the call waits for them.
     pub signal_semaphore: u64,
-    /// See `signal_semaphore`.
+    /// Value of `signal_semaphore`.
     pub signal_value: u64,
 }
 
-/// The answer to a text in one view.
+/// Answer to a text in one view.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkAnswer {
     /// sizeof(SvkAnswer)
     pub size: usize,
-    /// 1 = the text was found in this view; 0 where it is absent.
+    /// 1 = this view shows the thing that the text means.
     pub found: u32,
-    /// Level that answers: 0 = subparts, 1 = parts, 2 = wholes.
+    /// Level of the answer: 0 = subparts, 1 = parts, 2 = wholes.
     pub level: u32,
-    /// Best relevancy in the view, 0 to 1; 0.5 is as close as to an everyday phrase.
+    /// Best relevancy in the view, 0 to 1. At 0.5 a pixel is as similar to the text as to an
+    /// everyday phrase.
     pub score: f64,
-    /// Centre of the most relevant pixel; the first pixel's is (0.5, 0.5).
+    /// Centre of the most relevant pixel along x; the first pixel's centre is 0.5.
     pub x: f64,
-    /// See `x`.
+    /// Centre of the most relevant pixel along y; the first pixel's centre is 0.5.
     pub y: f64,
-    /// Pixels in the mask; 0 where the text was not found.
+    /// Number of pixels of the mask; 0 where nothing was found.
     pub mask_pixels: u64,
-    /// SvkPresence: whether the scene has it, whatever this view shows.
+    /// SvkPresence of the thing in the whole scene.
     pub presence: u32,
-    /// Things in space that the text means: those of svk_scene_instances.
+    /// Number of things in space that the text means, as of svk_scene_instances.
     pub instances: u32,
-    /// Share of other things that fit the scene at least as well: the p-value behind `presence`. 0
-    /// = unknown.
+    /// P-value of `presence`: share of texts, this one included, that fit the scene at least as
+    /// well. 0 = unknown.
     pub p_value: f64,
-    /// How far the photos agree on what answers, 0 to 1; below 0 = unknown.
+    /// Agreement of the photos on the answer, 0 to 1; below 0 = unknown.
     pub reliability: f64,
 }
 
-/// One of the things that a text means. Lengths are in scene units.
+/// A thing in space that a text means. Lengths are in scene units.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct SvkInstance {
     /// sizeof(SvkInstance)
     pub size: usize,
-    /// Number of its Gaussians.
+    /// Number of Gaussians.
     pub splats: u64,
-    /// Its share of all that answers the text, 0 to 1.
+    /// Share of the weight of all Gaussians that the text selects, 0 to 1.
     pub share: f64,
-    /// How far the photos agree on what it is, 0 to 1; below 0 = unknown.
+    /// Agreement of the photos on the thing, 0 to 1; below 0 = unknown.
     pub reliability: f64,
-    /// Middle of the oriented box.
+    /// Centre of the oriented bounding box.
     pub centre: [f64; 3],
-    /// Lowest corner of the box along the scene's axes.
+    /// Lowest corner of the bounding box along the scene's axes.
     pub box_min: [f64; 3],
-    /// Highest corner.
+    /// Highest corner of the bounding box along the scene's axes.
     pub box_max: [f64; 3],
-    /// Unit vectors along the edges of the oriented box.
+    /// Unit vectors along the edges of the oriented bounding box, largest variance first.
     pub axes: [[f64; 3]; 3],
-    /// Lengths of its edges, longest first.
+    /// Lengths of the edges of the oriented bounding box along `axes`.
     pub box_size: [f64; 3],
-    /// 1 = the view shows it, at (`x`, `y`).
+    /// 1 = the view shows the thing, at (`x`, `y`).
     pub seen: u64,
-    /// Pixel of its middle in the view; the first pixel's centre is (0.5, 0.5).
+    /// Pixel of `centre` in the view along x; the first pixel's centre is 0.5.
     pub x: f64,
-    /// See `x`.
+    /// Pixel of `centre` in the view along y; the first pixel's centre is 0.5.
     pub y: f64,
 }

@@ -233,47 +233,28 @@ pub struct ViewArgs {
     pub device: DeviceArgs,
 }
 
-/// Labels, masks and scores of `eval`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum ProtocolArg {
-    /// ground_truth.json: poses, images, depth, masks from codes; the default
-    Field,
-    /// LERF-OVS: a folder of frame_*.json, or ground_truth.json
-    Lerf,
-    /// 3D-OVS: a folder with segmentations/classes.txt, or ground_truth.json
-    #[value(name = "3dovs")]
-    Ovs,
-    /// ScanNet: a scene with label-filt/ and pose/; eight labels
-    Scannet,
-}
-
 /// `splatvk eval`
 #[derive(Debug, Args)]
 pub struct EvalArgs {
     /// Scene directory
     pub scene: PathBuf,
-    /// Folder of the labels, in the layout of the protocol
+    /// Folder with ground_truth.json
     #[arg(long, value_name = "DIR")]
     pub ground_truth: PathBuf,
-    /// Cameras of the data set, to score labelled frames that the scene was not made from:
-    /// transforms.json, a COLMAP model folder, or cameras.json
-    #[arg(long, value_name = "FILE")]
-    pub cameras: Option<PathBuf>,
     /// Write every rendered view and predicted mask here
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Write over what is there: ordinary files of the same names
     #[arg(long)]
     pub force: bool,
-    /// What is read and how it is scored
-    #[arg(long, value_enum, default_value = "field")]
-    pub protocol: ProtocolArg,
+    /// `field`; the published protocols are in splatlab
+    #[arg(long, value_name = "NAME", hide = true)]
+    pub protocol: Option<String>,
     /// Score held-out frames a second time, from cameras moved until the frozen scene fits their
     /// photos best: `refined`
     #[arg(long)]
     pub refine_views: bool,
-    /// Choose level, mask and location as others do (--protocol field) [default: as the scene was
-    /// made]
+    /// Choose level, mask and location as others do [default: as the scene was made]
     #[arg(long, value_parser = compats(), value_name = "WHOSE")]
     pub compat: Option<String>,
     /// Print a short table instead of JSON; --out DIR keeps eval.json

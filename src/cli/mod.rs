@@ -3,7 +3,7 @@ pub mod args;
 mod bench;
 mod clean;
 mod doctor;
-mod eval;
+pub mod eval;
 mod export;
 mod fetch;
 mod kept;
@@ -16,13 +16,13 @@ pub mod progress;
 mod query;
 mod render;
 mod run;
-mod scene;
+pub mod scene;
 mod serve;
 mod shell;
 mod train;
 mod usage;
 mod view;
-mod views;
+pub mod views;
 
 use crate::{Error, Result, gpu};
 use args::{Cli, Command, LogFormat};
@@ -121,4 +121,23 @@ fn moved(command: &str) -> Error {
         "{command} is a command of splatlab, which nothing installs: in a clone of {}, run `cargo run --release -p splatlab -- {command}`",
         env!("CARGO_PKG_REPOSITORY")
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[test]
+    fn moved_commands_name_splatlab() {
+        for line in [
+            &["ablate", "all", "--data", "x", "--help"][..],
+            &["generate", "--out", "x"],
+            &["eval", "scene", "--ground-truth", "x", "--protocol", "lerf"],
+        ] {
+            let error = Cli::try_parse_from([&["splatvk"], line].concat()).unwrap().execute().unwrap_err();
+            let says = format!("-p splatlab -- {}", line[0]);
+            assert!(error.exit_code() == 2 && error.to_string().contains(&says), "{error}");
+        }
+    }
 }

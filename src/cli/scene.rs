@@ -5,7 +5,7 @@ use crate::format::scene_dir::{self, Scene};
 use std::path::Path;
 
 /// Loads a scene directory or a file of Gaussians, and prints its warnings.
-pub(super) fn load(path: &Path) -> Result<Scene> {
+pub fn load(path: &Path) -> Result<Scene> {
     let scene = scene_dir::load(path)?;
     scene.warnings.iter().for_each(|note| progress::print_warning(note));
     Ok(scene)

@@ -8,7 +8,6 @@
 mod figures;
 mod instances;
 mod lengths;
-pub mod protocol;
 mod report;
 mod text;
 mod truth;

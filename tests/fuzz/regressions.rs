@@ -1,7 +1,7 @@
 //! Earlier findings that are small enough to generate: each stays within the limits of its reader.
 use super::readers::{Limits, within};
 use super::{ONE, seeds};
-use splatvk::eval::protocol::{self, ProtocolKind};
+use splatlab::protocol::{self, ProtocolKind};
 use splatvk::format::{cameras, colmap, gaussians, npy};
 use splatvk::infer::adapter::Adapter;
 use splatvk::infer::onnx;

@@ -1,8 +1,7 @@
-//! Data sets in their own layouts, as the runner takes them: frames that may be photos, labels, and
-//! cameras where known.
+//! Data sets of the supported layouts: frames that may be photos, labels, and cameras where known.
+use crate::protocol::{self, ProtocolKind};
 use crate::{Error, Result};
 use serde::Serialize;
-use splatvk::eval::protocol::{self, ProtocolKind};
 use splatvk::eval::{GroundTruth, Split, TruthFrame};
 use splatvk::format::cameras;
 use splatvk::photo::{Candidate, MAX_SIZE, join, sizes_of, working_size};
@@ -10,18 +9,18 @@ use splatvk::scene::{Camera, Pose};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// How a data set lies on disk, and by which protocol it is scored.
+/// Layout of a data set on disk; it defines the protocol of its scores.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Layout {
     /// `ground_truth.json`, scored by protocol `field` on held-out frames.
     Own,
-    /// One of the published ones, scored by its protocol.
+    /// A published layout, scored by its protocol.
     Published(ProtocolKind),
 }
 
 impl Layout {
-    /// What lies in a folder.
+    /// Recognises the layout of a folder.
     pub fn of(folder: &Path) -> Option<Layout> {
         let has = |name: &str| folder.join(name).exists();
         if has("ground_truth.json") {
@@ -35,18 +34,18 @@ impl Layout {
         }
     }
 
-    /// What the paper's figures are filed under.
+    /// Name of the data set in the paper's figures.
     pub(super) fn paper(self) -> &'static str {
         match self {
             Layout::Published(ProtocolKind::Ovs) => "3dovs",
             Layout::Published(ProtocolKind::ScanNet) => "scannet",
-            // The paper has no figures on generated scenes: those on LERF stand beside them.
+            // The paper has no figures on generated scenes; those on LERF take their place.
             Layout::Published(_) | Layout::Own => "lerf",
         }
     }
 
-    /// The frames of the first column: the authors' script scores labelled photos, and everything
-    /// else held-out views.
+    /// Split of the frames of the first column: labelled photos where the authors' script scores
+    /// them, else held-out views.
     pub(super) fn headline(self) -> Split {
         match self {
             Layout::Published(ProtocolKind::Lerf | ProtocolKind::Ovs) => Split::Train,
@@ -54,7 +53,7 @@ impl Layout {
         }
     }
 
-    /// Photos of the paper's runs.
+    /// Number of photos in the paper's runs.
     pub(super) fn views(self) -> usize {
         match self {
             Layout::Published(ProtocolKind::Ovs) => 3,
@@ -63,28 +62,28 @@ impl Layout {
     }
 }
 
-/// A data set with the name that its measurements carry.
+/// A data set, with its name in measurements.
 #[derive(Clone, Debug)]
 pub struct DataSet {
-    /// Distinct within a run.
+    /// Name, distinct within a run.
     pub name: String,
-    /// How it lies on disk.
+    /// Layout on disk.
     pub layout: Layout,
-    /// Frames and labels. Of a published layout every labelled frame with a photo, all of them in
-    /// the split `train`: which are photos of a scene is the row's choice.
+    /// Frames and labels. A published layout has every labelled frame with a photo, all in the
+    /// split `train`; rows choose their photos from them.
     pub truth: GroundTruth,
-    /// Where its protocol reads labels.
+    /// Folder from which the protocol reads labels.
     pub(super) labels: PathBuf,
-    /// Its own cameras, if it states any.
+    /// Cameras of a published data set, if it has any.
     pub(super) known: Vec<Camera>,
 }
 
-/// The frames that the first columns of a table are means over: the same for all of its rows.
+/// Frames whose means the first columns of a table are; the same for all of its rows.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Scope {
-    /// The split of these frames, which a published report sums up.
+    /// Split of these frames, whose summary a published report has.
     pub(super) headline: Split,
-    /// Stems: held-out frames that no row has seen as photos, or photos that all rows have.
+    /// Stems of the held-out frames that are photos of no row, or of the photos that all rows have.
     pub(super) frames: BTreeSet<String>,
 }
 
@@ -98,11 +97,11 @@ impl Scope {
     }
 }
 
-/// Labels of a LERF-OVS scene: `lerf_ovs/label/SCENE` beside `lerf_ovs/SCENE`, or in the scene's
-/// own folder.
+/// Folder with the labels of a LERF-OVS scene: `lerf_ovs/label/SCENE` beside `lerf_ovs/SCENE`, or
+/// `label` in the scene's folder.
 fn lerf_labels(folder: &Path) -> Option<PathBuf> {
-    let whole = folder.canonicalize().ok()?;
-    let beside = whole.parent().zip(whole.file_name()).map(|(up, name)| up.join("label").join(name));
+    let absolute = folder.canonicalize().ok()?;
+    let beside = absolute.parent().zip(absolute.file_name()).map(|(up, name)| up.join("label").join(name));
     let places = beside.into_iter().chain([folder.join("label")]);
     places.into_iter().find(|place| {
         let mut files = std::fs::read_dir(place).into_iter().flatten().flatten();
@@ -111,8 +110,8 @@ fn lerf_labels(folder: &Path) -> Option<PathBuf> {
 }
 
 impl DataSet {
-    /// Opens a folder, in the given layout or in that of what lies there; refuses what no row could
-    /// be scored on.
+    /// Opens a folder in the given layout, or in the one that is recognised. An error where rows
+    /// could not be scored: no labels, or too few frames.
     pub fn open(name: String, folder: &Path, layout: Option<Layout>) -> Result<DataSet> {
         let layout = layout.or_else(|| Layout::of(folder)).ok_or_else(|| {
             Error::input(format!(
@@ -143,6 +142,7 @@ impl DataSet {
     }
 }
 
+/// Opens a data set of a published layout.
 fn published(name: String, folder: &Path, kind: ProtocolKind) -> Result<DataSet> {
     let labels = match kind {
         ProtocolKind::Lerf => lerf_labels(folder).ok_or_else(|| {
@@ -167,7 +167,7 @@ fn published(name: String, folder: &Path, kind: ProtocolKind) -> Result<DataSet>
         let (width, height) = working_size(w, h, MAX_SIZE);
         let (width, height) = (width as u32, height as u32);
         let own = own.map(|k| &known[k]);
-        // A frame without a camera of its own can be a photo, and is held out of nothing.
+        // A frame without a camera can be a photo but no held-out view.
         let camera = own.map(|c| c.resized(width, height)).unwrap_or_else(|| unknown(&name, width, height));
         frames.push(TruthFrame { file, stem: name, split: Split::Train, camera, lens: None });
     }
@@ -181,7 +181,7 @@ fn published(name: String, folder: &Path, kind: ProtocolKind) -> Result<DataSet>
     Ok(DataSet { name, layout: Layout::Published(kind), truth, labels, known })
 }
 
-/// The photo of a frame, relative to the scene's folder.
+/// Path of a frame's photo, relative to the scene's folder.
 fn photo(folder: &Path, stem: &str) -> Option<String> {
     let names = ["images", "color"].into_iter().flat_map(|dir| {
         ["jpg", "JPG", "jpeg", "png", "PNG"].map(|extension| format!("{dir}/{stem}.{extension}"))
@@ -189,7 +189,7 @@ fn photo(folder: &Path, stem: &str) -> Option<String> {
     names.into_iter().find(|name| folder.join(name).is_file())
 }
 
-/// `transforms.json` or a COLMAP model in the folder of a scene.
+/// Cameras of `transforms.json` or of a COLMAP model in the folder of a scene.
 fn cameras_beside(folder: &Path) -> Result<Vec<Camera>> {
     let model = ["sparse/0", "sparse"]
         .iter()
@@ -197,6 +197,7 @@ fn cameras_beside(folder: &Path) -> Result<Vec<Camera>> {
     if model || folder.join("transforms.json").is_file() { cameras::read(folder) } else { Ok(Vec::new()) }
 }
 
+/// Placeholder camera of a frame without one.
 fn unknown(name: &str, width: u32, height: u32) -> Camera {
     let (fx, cx, cy) = (f64::from(width), f64::from(width) / 2.0, f64::from(height) / 2.0);
     Camera { name: name.to_owned(), width, height, fx, fy: fx, cx, cy, pose: Pose::IDENTITY }

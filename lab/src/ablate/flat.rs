@@ -1,32 +1,32 @@
-//! Features in 2D: what an encoder says of a photo's own pixels, without a scene (the row "LSeg" of
-//! the paper's comparison with LSM). Every cell of a few pixels is a code of its own, so that the
-//! rules of the protocols apply unchanged.
+//! Features in 2D, without a scene: an encoder's features of the photo's own pixels (the row "LSeg"
+//! of the paper's comparison with LSM). Every cell of a few pixels is a code of its own, so that
+//! the rules of the protocols apply unchanged.
 use super::data::DataSet;
-use super::stages::{Scored, asked};
+use super::stages::{Scored, queries_for};
 use crate::Result;
-use splatvk::eval::protocol::{self, CodeScores, DecodedView, ProtocolKind};
+use crate::protocol::{self, CodeScores, DecodedView, ProtocolKind};
 use splatvk::eval::{Evaluation, GroundTruth, Rendered, Split};
 use splatvk::progress::Progress;
 use splatvk::query::{QueryOptions, TextQuery, answer_with, field_relevancy};
 use splatvk::run::stages::SharedEncoder;
 use splatvk::scene::{Camera, Codebook, Image, LanguageField, LevelField, RgbImage};
 
-/// Pixels along a cell. LSeg's features come at half the size of its input, which is about half
-/// that of a LERF photo.
+/// Side of a cell, pixels. LSeg's features have half the size of its input, which has about half
+/// the size of a LERF photo.
 const CELL: usize = 4;
 
-/// One photo as a field of one level, and the code of each pixel.
-fn described(
+/// Language field of one level of a photo, and the code of each pixel.
+fn photo_field(
     image: &RgbImage,
     encoder: &SharedEncoder,
     progress: &dyn Progress,
 ) -> Result<(LanguageField, Vec<Image<i32>>)> {
     let (columns, rows) = (image.width.div_ceil(CELL), image.height.div_ceil(CELL));
-    let cell = |p: usize| (p / image.width / CELL * columns + p % image.width / CELL) as i32;
+    let cell_index = |p: usize| (p / image.width / CELL * columns + p % image.width / CELL) as i32;
     let labels = Image {
         width: image.width,
         height: image.height,
-        data: (0..image.width * image.height).map(cell).collect(),
+        data: (0..image.width * image.height).map(cell_index).collect(),
     };
     let (embedding_dim, embeddings) =
         encoder.with(|e| e.embed_regions(image, &labels, columns * rows, progress).map(|f| (e.dim(), f)))?;
@@ -35,7 +35,7 @@ fn described(
     Ok((LanguageField { levels: vec![level], space: encoder.space().to_owned() }, vec![labels]))
 }
 
-/// By protocol `field`, every frame.
+/// Scores every frame by protocol `field`.
 pub(super) fn field(
     truth: &GroundTruth,
     encoder: &SharedEncoder,
@@ -50,7 +50,7 @@ pub(super) fn field(
     for (k, frame) in truth.frames.iter().enumerate() {
         progress.check()?;
         let rgb = truth.image(frame)?;
-        let (field, codes) = described(&rgb, encoder, progress)?;
+        let (field, codes) = photo_field(&rgb, encoder, progress)?;
         let mut answers = Vec::new();
         for (label, query) in labels.iter().zip(queries) {
             let relevancy = field_relevancy(&field, query)?;
@@ -62,13 +62,13 @@ pub(super) fn field(
         progress.step(k as u64 + 1, "");
     }
     progress.end();
-    // Nothing was rendered: the photo is compared with itself there.
+    // Nothing was rendered: these figures compare photos with themselves.
     let mut report = evaluation.finish();
     report.images.clear();
     Ok(Scored { report, ..Scored::default() })
 }
 
-/// By a published protocol, every labelled photo.
+/// Scores every labelled photo by a published protocol.
 pub(super) fn published(
     data: &DataSet,
     kind: ProtocolKind,
@@ -76,18 +76,18 @@ pub(super) fn published(
     queries: &[TextQuery],
     progress: &dyn Progress,
 ) -> Result<Scored> {
-    // Each photo is its own view; where it stands does not matter.
+    // Each photo is its own view; its pose does not matter.
     let cameras: Vec<Camera> =
         data.truth.frames.iter().map(|f| Camera { name: f.stem.clone(), ..f.camera.clone() }).collect();
     let mut protocol = protocol::open(kind, &data.labels, &cameras, &[])?;
-    let asked = asked(&protocol.prompts(), queries);
+    let queries = queries_for(&protocol.prompts(), queries);
     let views = protocol.views().to_vec();
     progress.begin("eval", views.len() as u64);
     for (k, view) in views.iter().enumerate() {
         progress.check()?;
         let Some(frame) = data.truth.frames.iter().find(|f| f.stem == view.stem) else { continue };
-        let (field, codes) = described(&data.truth.image(frame)?, encoder, progress)?;
-        let scores = CodeScores::new(&field, &asked)?;
+        let (field, codes) = photo_field(&data.truth.image(frame)?, encoder, progress)?;
+        let scores = CodeScores::new(&field, &queries)?;
         protocol.add(k, &DecodedView { codes: &codes, scores: &scores })?;
         progress.step(k as u64 + 1, "");
     }
@@ -103,7 +103,7 @@ mod tests {
     use splatvk::language::dir::normalise_rows;
     use splatvk::progress::Silent;
 
-    /// Regions are their mean colour, texts the colour that they name.
+    /// Encoder whose feature of a region is its normalised mean colour.
     struct Colours;
 
     impl RegionEncoder for Colours {
@@ -133,28 +133,28 @@ mod tests {
     }
 
     #[test]
-    fn the_pixels_of_labelled_photos_answer_for_themselves() {
+    fn published_scores_photos_by_their_pixels() {
         let folder = tempfile::tempdir().unwrap();
-        let at = |name: &str| folder.path().join(name);
-        std::fs::create_dir_all(at("images")).unwrap();
+        let path = |name: &str| folder.path().join(name);
+        std::fs::create_dir_all(path("images")).unwrap();
         let side = 120;
         for stem in ["0", "1"] {
             // Red left of the middle, blue right of it: 7200 pixels each, and no cell across the
             // border.
-            let red = |x: u32| x < side / 2;
+            let is_red = |x: u32| x < side / 2;
             let photo = image::RgbImage::from_fn(side, side, |x, _| {
-                image::Rgb(if red(x) { [250, 0, 0] } else { [0, 0, 250] })
+                image::Rgb(if is_red(x) { [250, 0, 0] } else { [0, 0, 250] })
             });
-            photo.save(at(&format!("images/{stem}.png"))).unwrap();
-            std::fs::create_dir_all(at(&format!("segmentations/{stem}"))).unwrap();
-            for (class, of) in [("red half", true), ("blue half", false)] {
+            photo.save(path(&format!("images/{stem}.png"))).unwrap();
+            std::fs::create_dir_all(path(&format!("segmentations/{stem}"))).unwrap();
+            for (class, red) in [("red half", true), ("blue half", false)] {
                 let mask = image::GrayImage::from_fn(side, side, |x, _| {
-                    image::Luma([if red(x) == of { 255 } else { 0 }])
+                    image::Luma([if is_red(x) == red { 255 } else { 0 }])
                 });
-                mask.save(at(&format!("segmentations/{stem}/{class}.png"))).unwrap();
+                mask.save(path(&format!("segmentations/{stem}/{class}.png"))).unwrap();
             }
         }
-        std::fs::write(at("segmentations/classes.txt"), "red half\nblue half\n").unwrap();
+        std::fs::write(path("segmentations/classes.txt"), "red half\nblue half\n").unwrap();
         let data = DataSet::open("halves".into(), folder.path(), None).unwrap();
         assert_eq!(data.layout, Layout::Published(ProtocolKind::Ovs));
         let query = |text: &str, embedding: [f32; 3]| TextQuery {
@@ -171,6 +171,6 @@ mod tests {
             scored.published.unwrap().summary["train"].figures["miou"]
         };
         assert_eq!(miou([1.0, 0.0, 0.0]), 1.0);
-        assert_eq!(miou([0.0, 0.0, 1.0]), 0.5, "a text that means the other half finds the other half");
+        assert_eq!(miou([0.0, 0.0, 1.0]), 0.5, "the embedding of the other half finds the other half");
     }
 }

@@ -1,44 +1,44 @@
-//! What one row gave on one data set with one seed.
+//! Figures of one row on one data set with one seed.
 use super::data::Scope;
 use super::runner::RowFigures;
 use super::setup::{RowWork, TableRow};
 use super::stages::Scored;
 use super::tables::Table;
+use crate::protocol::{ProtocolKind, ProtocolReport};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use splatvk::eval::Split;
-use splatvk::eval::protocol::{ProtocolKind, ProtocolReport};
 use std::collections::BTreeMap;
 
-/// One row on one data set with one seed: plain data, which a later process can read back.
+/// Result of one row on one data set with one seed: plain data, which a later process can read.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Measurement {
     /// Name of the data set.
     pub data: String,
     /// Seed of the run.
     pub seed: u64,
-    /// Table.
+    /// Name of the table.
     pub table: String,
-    /// Group of rows.
+    /// Group of the row.
     pub group: String,
-    /// Row.
+    /// Name of the row in its group.
     pub label: String,
-    /// The other rows of the group are compared with this one.
+    /// Whether the other rows of the group are compared with this one.
     pub reference: bool,
-    /// What ran, as JSON; null where nothing did.
+    /// Setup that ran, as JSON; null where nothing ran.
     pub setup: Value,
-    /// What the reader should know; why there is no figure, where there is none.
+    /// Remark for the reader, or the reason for missing figures.
     pub note: String,
-    /// The row was to run and could not.
+    /// Whether the row ran and failed.
     pub failed: bool,
-    /// By column.
+    /// Figures by column.
     pub figures: BTreeMap<String, f64>,
-    /// IoU per phrase on the frames that count.
+    /// Mean IoU per phrase on the frames of the scope.
     pub iou: BTreeMap<String, f64>,
 }
 
 impl Measurement {
-    /// Of a row before it ran.
+    /// Makes the measurement of a row before it runs.
     pub(super) fn begun(table: &Table, row: &TableRow, data: &str, seed: u64) -> Measurement {
         let setup = match &row.runs {
             RowWork::Score(setup) | RowWork::MemoryOnly(setup) => serde_json::to_value(setup),
@@ -52,7 +52,7 @@ impl Measurement {
             group: row.group.clone(),
             label: row.label.clone(),
             reference: false,
-            // Plain data; numbers and texts alone.
+            // Plain numbers and texts: serialising them cannot fail.
             setup: setup.unwrap_or_default(),
             note: row.note.clone(),
             failed: false,
@@ -61,7 +61,7 @@ impl Measurement {
         }
     }
 
-    /// Whether it is the same row of the same table, data and seed, run the same way.
+    /// Whether both are of the same row, data set and seed, with the same setup.
     pub fn repeats(&self, other: &Measurement) -> bool {
         let key =
             |m: &Measurement| (m.data.clone(), m.seed, m.table.clone(), m.group.clone(), m.label.clone());
@@ -76,11 +76,12 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
     (n > 0).then(|| sum / n as f64)
 }
 
+/// Inserts a figure, if there is one.
 fn put(out: &mut Figures, name: &str, value: Option<f64>) {
     out.extend(value.map(|v| (name.to_owned(), v)));
 }
 
-/// What a row was scored with, by column.
+/// Scores of a row, by column.
 pub(super) fn scores(scored: &Scored, scope: &Scope) -> Figures {
     let mut out = match &scored.published {
         Some(report) => published(report, scope),
@@ -92,25 +93,26 @@ pub(super) fn scores(scored: &Scored, scope: &Scope) -> Figures {
     out
 }
 
+/// Scores by protocol `field`.
 fn field(scored: &Scored, scope: &Scope) -> Figures {
     let (report, mut out) = (&scored.report, Figures::new());
-    let counts = |frame: &String| scope.frames.contains(frame);
-    let masks = || report.masks.iter().filter(|m| counts(&m.frame));
+    let in_scope = |frame: &String| scope.frames.contains(frame);
+    let masks = || report.masks.iter().filter(|m| in_scope(&m.frame));
     put(&mut out, "mIoU", mean(masks().map(|m| m.iou)));
     put(&mut out, "mAcc", mean(masks().map(|m| f64::from(m.localised))));
-    put(&mut out, "PSNR", mean(report.images.iter().filter(|i| counts(&i.frame)).map(|i| i.psnr)));
+    put(&mut out, "PSNR", mean(report.images.iter().filter(|i| in_scope(&i.frame)).map(|i| i.psnr)));
     let others = report.masks.iter().filter(|m| m.split != scope.headline);
     put(&mut out, scope.other(), mean(others.map(|m| m.iou)));
     out
 }
 
-/// Means over (frame, phrase) pairs where the protocol has them, else its own summary: ScanNet
-/// counts pixels of all frames.
+/// Scores by a published protocol: means over (frame, phrase) pairs, or the summary of ScanNet,
+/// which counts pixels of all frames.
 fn published(report: &ProtocolReport, scope: &Scope) -> Figures {
     let mut out = Figures::new();
-    let of_split = |split: Split| report.summary.get(split.name());
+    let summary = |split: Split| report.summary.get(split.name());
     if report.protocol == ProtocolKind::ScanNet {
-        let first = of_split(scope.headline).or_else(|| report.summary.values().next());
+        let first = summary(scope.headline).or_else(|| report.summary.values().next());
         put(&mut out, "mIoU", first.and_then(|s| s.figures.get("miou")).copied());
         put(&mut out, "mAcc", first.and_then(|s| s.figures.get("accuracy")).copied());
     } else {
@@ -123,11 +125,11 @@ fn published(report: &ProtocolReport, scope: &Scope) -> Figures {
         Split::Train => Split::Test,
         _ => Split::Train,
     };
-    put(&mut out, scope.other(), of_split(rest).and_then(|s| s.figures.get("miou")).copied());
+    put(&mut out, scope.other(), summary(rest).and_then(|s| s.figures.get("miou")).copied());
     out
 }
 
-/// The figures of a row that made a scene, by column.
+/// Figures of a row with a scene, by column.
 pub(super) fn figures(o: &RowFigures, scope: &Scope) -> Figures {
     let mut out = scores(&o.scored, scope);
     put(&mut out, "splats", Some(o.splats as f64));
@@ -139,7 +141,7 @@ pub(super) fn figures(o: &RowFigures, scope: &Scope) -> Figures {
     out
 }
 
-/// Mean IoU per phrase on the frames that count.
+/// Mean IoU per phrase on the frames of the scope.
 pub(super) fn iou(scored: &Scored, scope: &Scope) -> Figures {
     let mut phrases: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     let mut add = |frame: &String, phrase: &String, iou| {
@@ -176,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn figures_leave_out_photos_and_frames_that_any_row_has_seen() {
+    fn figures_use_frames_of_scope() {
         let masks = vec![
             mask("p", Split::Train, 0.9, true),
             mask("a", Split::Test, 0.2, false),

@@ -2,10 +2,9 @@
 //!
 //! A table is a list of setups ([`Setup`]) that differ in one thing. A [`Runner`] runs each on one
 //! data set as a graph of stages over one store in memory: cameras, points and splats are made once
-//! for most tables, and what no random number enters once for all seeds. What a row gave is a
-//! [`Measurement`]; a [`FinishedTable`] is the means of all of them. Figures are those of protocol
-//! `field` on held-out frames, or of the published protocol whose layout a data set has
-//! ([`Layout`]).
+//! for most tables, and stages without random numbers once for all seeds. The result of a row is a
+//! [`Measurement`]; a [`FinishedTable`] holds the means. Figures are those of protocol `field` on
+//! held-out frames, or of the published protocol whose layout a data set has ([`Layout`]).
 mod data;
 mod flat;
 mod measure;
@@ -35,22 +34,23 @@ use splatvk::infer::Registry;
 use splatvk::progress::Progress;
 use splatvk::run::method::SPARSELGS;
 
-/// What to run.
+/// Tables to run, with the options of all rows.
 #[derive(Clone, serde::Serialize)]
 pub struct Plan {
-    /// In order.
+    /// Tables in the order in which they run.
     pub tables: Vec<&'static Table>,
-    /// What rows take that do not vary it.
+    /// Sources of rows that do not vary them.
     pub sources: Sources,
-    /// Masks and features for every table; none = what each table is about.
+    /// Masks and features of every table; `None`: those of [`Table`].
     pub regions: Option<Regions>,
-    /// Photos of the default row; none = all train frames, at most as many as the paper takes.
+    /// Photos of the default row; `None`: all train frames, at most the paper's number.
     pub views: Option<usize>,
-    /// Take the true cameras in every row, for photos that alone would give none.
+    /// Whether every row takes the true cameras, for photos that cannot be registered.
     pub true_cameras: bool,
-    /// Most stereo points that splats start from, in rows that do not vary it; none = the preset's.
+    /// Maximum of stereo points that splats start from, in rows that do not vary it; `None`: the
+    /// preset's.
     pub max_points: Option<usize>,
-    /// Each a run of its own: of cameras, stereo, training and injected errors.
+    /// Seeds of cameras, stereo, training and injected errors; each is a run of its own.
     pub seeds: Vec<u64>,
     /// Steps of the colour stage.
     pub iterations: usize,
@@ -69,26 +69,26 @@ impl Default for Plan {
             max_points: None,
             seeds: vec![0],
             iterations: RgbOptions::preset(Preset::Draft).iterations,
-            // Three times draft's, whose features hardly leave their lifted start: methods differ
-            // in where training takes them.
+            // Three times draft's, whose features hardly leave their lifted start; methods differ
+            // in the result of training.
             language_iterations: 3 * LanguageOptions::preset(Preset::Draft).iterations,
         }
     }
 }
 
-/// What a run has got to: the measurements so far, and the table that is finished with the last of
-/// them.
+/// State of a run after a row: the measurements so far, and the table that the last of them
+/// finishes.
 pub struct Finished<'m> {
-    /// In the order in which they were made.
+    /// Measurements in the order in which they were made.
     pub measurements: &'m [Measurement],
-    /// A table that no later measurement belongs to.
+    /// A table without later measurements.
     pub table: Option<&'static Table>,
 }
 
-/// Runs the tables on every data set with every seed, one data set after the other, and drops what
-/// was made of one before the next. `keep` is told after every row. Rows of `earlier` that were
-/// measured the same way are taken from there. A row that cannot be measured says why and the
-/// others go on; an error is what stopped every row, a lost device, or the user.
+/// Runs the tables on every data set with every seed, one data set after the other; outputs of a
+/// data set are dropped before the next. `keep` is called after every row. Rows of `earlier` with
+/// the same setup are not measured again. A row that fails has a note with the reason, and the
+/// others go on; the run fails where all rows fail, the device is lost, or the user stops it.
 pub fn run(
     plan: &Plan,
     sets: Vec<DataSet>,
@@ -99,7 +99,7 @@ pub fn run(
 ) -> Result<Vec<Measurement>> {
     let mut study = Study { plan, earlier, measurements: Vec::new(), first_error: None, keep };
     let last = sets.len().saturating_sub(1);
-    for (at, set) in sets.into_iter().enumerate() {
+    for (index, set) in sets.into_iter().enumerate() {
         let name = set.name.clone();
         let mut lab = Runner::open(device, registry, set, progress);
         for (k, &seed) in plan.seeds.iter().enumerate() {
@@ -107,7 +107,7 @@ pub fn run(
             lab.start_seed(seed);
             for table in plan.tables.iter().copied() {
                 study.table(&mut lab, &name, seed, table)?;
-                let finished = (at == last && k + 1 == plan.seeds.len()).then_some(table);
+                let finished = (index == last && k + 1 == plan.seeds.len()).then_some(table);
                 (study.keep)(Finished { measurements: &study.measurements, table: finished })?;
             }
         }
@@ -118,7 +118,7 @@ pub fn run(
     }
 }
 
-/// A run that is under way.
+/// State of a run.
 struct Study<'a> {
     plan: &'a Plan,
     earlier: &'a [Measurement],
@@ -128,7 +128,7 @@ struct Study<'a> {
 }
 
 impl Study<'_> {
-    /// Runs the rows of a table on one data set with one seed.
+    /// Measures the rows of a table on one data set with one seed.
     fn table(&mut self, lab: &mut Runner, data: &str, seed: u64, table: &'static Table) -> Result<()> {
         let available = lab.available();
         let sources = &self.plan.sources;
@@ -137,11 +137,11 @@ impl Study<'_> {
         for regions in given.unwrap_or_else(|| (table.regions)(sources, &available)) {
             let base = self.base(lab, regions);
             let group = Group { base, sources, available: &available };
-            let of_group = (table.rows)(&group);
+            let group_rows = (table.rows)(&group);
             let is_base = |row: &TableRow| matches!(&row.runs, RowWork::Score(setup) if *setup == group.base);
-            // The program's own way where the table has it, else the first row.
-            let reference = of_group.iter().position(is_base).unwrap_or(0);
-            rows.extend(of_group.into_iter().enumerate().map(|(k, row)| (row, k == reference)));
+            // The default setup where the table has it, else the first row.
+            let reference = group_rows.iter().position(is_base).unwrap_or(0);
+            rows.extend(group_rows.into_iter().enumerate().map(|(k, row)| (row, k == reference)));
         }
         let scope = lab.scope(rows.iter().map(|r| &r.0));
         for (row, reference) in &rows {
@@ -157,6 +157,7 @@ impl Study<'_> {
         Ok(())
     }
 
+    /// Setup of rows that vary nothing.
     fn base(&self, lab: &Runner, regions: Regions) -> Setup {
         let Plan { sources, views, true_cameras, max_points, iterations, language_iterations, .. } =
             self.plan;
@@ -173,7 +174,7 @@ impl Study<'_> {
         }
     }
 
-    /// Runs a row. What stops it is a finding about it; the other rows still count.
+    /// Measures a row. A failure becomes its note; a lost device and the user's stop are errors.
     fn measured(
         &mut self,
         lab: &mut Runner,
@@ -199,7 +200,7 @@ impl Study<'_> {
             RowWork::Nothing => Ok(begun.clone()),
         };
         match outcome {
-            // Without its device no later row can be measured either.
+            // No later row can be measured without the device.
             Err(error @ (Error::Cancelled | Error::DeviceLost { .. })) => Err(error),
             Err(error) => {
                 let note = error.to_string();
@@ -217,10 +218,10 @@ mod tests {
     use splatvk::progress::Silent;
 
     #[test]
-    fn rows_that_failed_in_an_earlier_run_are_tried_again() {
+    fn run_retries_failed_rows() {
         let (device, registry) = (splatvk::gpu::open(None).unwrap(), Registry::open(None).unwrap());
-        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast");
-        // More photos than there are frames: every row fails before any work.
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/breakfast");
+        // With more photos than frames every row fails before any work.
         let plan = Plan {
             tables: vec![table("alignment").unwrap()],
             regions: Some(Regions::Exact),

@@ -1,8 +1,7 @@
 //! The paper's own figures for the rows of the tables (SparseLGS, its sections "Experiments" and
 //! "Ablation studies").
 
-/// Figures of one table on one data set: columns, then rows with a value per column; NaN where the
-/// paper has none.
+/// Figures of one table on one data set: a value per row and column; NaN where the paper has none.
 struct Block {
     table: &'static str,
     /// Data set, or scene of one as `SET/SCENE`.
@@ -21,8 +20,8 @@ const TIMED: &[&str] = &["mIoU", "mAcc", "Tr.T", "T.T"];
 const SCORES: &[&str] = &["mIoU", "mAcc"];
 const IOU: &[&str] = &["mIoU"];
 
-/// The paper's mean accuracy on LERF is 0.770 in its tables of methods and 0.786 in those of
-/// ablations; the four scenes' own figures average 0.795.
+/// All figures of the paper. Its mean accuracy on LERF is 0.770 in the tables of methods and 0.786
+/// in those of ablations; the figures of the four scenes average 0.795.
 static BLOCKS: &[Block] = &[
     Block {
         table: "methods",
@@ -171,14 +170,13 @@ static BLOCKS: &[Block] = &[
     },
 ];
 
-/// The paper's figures for a row, by column: those of the first of the data sets that has any for
-/// the row.
+/// The paper's figures of a row, by column: those of the first data set that has any.
 pub(super) fn figures(table: &str, row: &str, data: &[String]) -> Vec<(&'static str, f64)> {
-    let of = |set: &String| {
+    let find = |set: &String| {
         let mut blocks = BLOCKS.iter().filter(|b| b.table == table && b.data == set);
         blocks.find_map(|b| Some((b.columns, b.rows.iter().find(|r| r.0 == row)?.1)))
     };
-    let Some((columns, values)) = data.iter().find_map(of) else { return Vec::new() };
+    let Some((columns, values)) = data.iter().find_map(find) else { return Vec::new() };
     columns.iter().copied().zip(values.iter().copied()).filter(|(_, v)| !v.is_nan()).collect()
 }
 
@@ -188,24 +186,24 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_scene_s_own_figures_come_before_those_of_its_data_set() {
-        let of = |data: &[&str]| {
+    fn figures_prefer_scene_to_data_set() {
+        let sparselgs = |data: &[&str]| {
             figures("methods", "sparselgs", &data.iter().map(|d| (*d).to_owned()).collect::<Vec<_>>())
         };
-        assert_eq!(of(&["lerf/teatime", "lerf"]), [("mIoU", 0.713), ("mAcc", 0.868)]);
-        assert_eq!(of(&["lerf/other", "lerf"])[0], ("mIoU", 0.538));
-        assert_eq!(of(&["scannet"]), []);
-        // What a table has no figure for has none, not NaN.
+        assert_eq!(sparselgs(&["lerf/teatime", "lerf"]), [("mIoU", 0.713), ("mAcc", 0.868)]);
+        assert_eq!(sparselgs(&["lerf/other", "lerf"])[0], ("mIoU", 0.538));
+        assert_eq!(sparselgs(&["scannet"]), []);
+        // Columns without a figure are left out, not NaN.
         assert_eq!(figures("methods", "legaussians", &["lerf".to_owned()]).len(), 2);
     }
 
     #[test]
-    fn every_block_belongs_to_a_table_and_is_as_wide_as_its_columns() {
+    fn blocks_fit_their_tables() {
         for block in BLOCKS {
-            let of = table(block.table).unwrap_or_else(|| panic!("no table {}", block.table));
+            let table = table(block.table).unwrap_or_else(|| panic!("no table {}", block.table));
             let shared = ["mIoU", "mAcc", "Tr.T", "T.T"];
             for column in block.columns {
-                let own = of.columns.iter().any(|c| c.0 == *column);
+                let own = table.columns.iter().any(|c| c.0 == *column);
                 assert!(own || shared.contains(column), "{}: no column {column}", block.table);
             }
             for (row, values) in block.rows {

@@ -1,5 +1,5 @@
-//! Runs setups as graphs of stages that share one store: setups that agree up to a stage share what
-//! that stage made.
+//! Runs setups as graphs of stages that share one store: setups that agree up to a stage share its
+//! output.
 use super::data::{DataSet, Layout, Scope};
 use super::flat;
 use super::setup::{Available, Network, Regions, RowWork, Setup, TableRow};
@@ -31,28 +31,28 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-/// What came out of a setup.
+/// Results of a setup.
 #[derive(Clone)]
 #[non_exhaustive]
 pub struct RowFigures {
-    /// Figures of protocol `field`, and agreement of decoded embeddings with the true ones.
+    /// Scores, and agreement of decoded embeddings with the true ones.
     pub scored: Arc<Scored>,
-    /// Splats of the finished scene.
+    /// Number of splats of the finished scene.
     pub splats: usize,
-    /// Codes per level.
+    /// Number of codes per level.
     pub codes: Vec<usize>,
-    /// Parameters, gradients, optimiser state and pixel planes of the features in training, bytes.
+    /// Bytes of parameters, gradients, optimiser state and pixel planes of the features in
+    /// training.
     pub feature_bytes: u64,
     /// Seconds of alignment, language stage and scoring.
     pub seconds: f64,
     /// Seconds of both training stages.
     pub training_seconds: f64,
-    /// Seconds of all stages from photos to the finished scene, one after the other, shared ones
-    /// included.
+    /// Sum of the seconds of all stages from photos to the finished scene, shared ones included.
     pub total_seconds: f64,
 }
 
-/// The machine, one data set, and what was made of it.
+/// Runs setups on one data set and one device, and keeps their outputs.
 pub struct Runner<'a> {
     device: &'a Device,
     registry: &'a Registry,
@@ -62,21 +62,22 @@ pub struct Runner<'a> {
     progress: &'a dyn Progress,
     store: Store,
     encoders: Vec<Encoder>,
-    /// Setups that ran with this seed.
+    /// Setups that ran with this seed, and their results.
     done: Vec<(Setup, RowFigures)>,
 }
 
-/// An encoder with its answers to the evaluation's phrases.
+/// An encoder with the embedded queries of the evaluation's phrases.
 struct Encoder {
     choice: SourceChoice,
     encoder: SharedEncoder,
     queries: Vec<TextQuery>,
 }
 
-/// Trained features are large, and rows of one setup share their figures.
+/// Stages whose outputs the store does not keep: trained features are large, and rows of one setup
+/// share their results.
 const PASSING: &[&str] = &["language"];
 
-/// The stages of a setup.
+/// Graph of a setup, with the outputs that [`Runner`] reads.
 struct Stages {
     build: GraphBuilder,
     placed: Output<PlacedPhotos>,
@@ -87,19 +88,19 @@ struct Stages {
     queries: Vec<TextQuery>,
 }
 
-/// Bytes that `channels` features of `splats` splats take while they are trained in views of
-/// `pixels` pixels: value, raw value, gradient and two moments each, and a plane with its gradient
-/// per channel.
+/// Bytes of `channels` features of `splats` splats in training on views of `pixels` pixels: value,
+/// raw value, gradient and two moments each, and an image with its gradient per channel.
 pub fn feature_bytes(splats: usize, channels: usize, pixels: usize) -> u64 {
     4 * channels as u64 * (5 * splats as u64 + 2 * pixels as u64)
 }
 
+/// Pixels of the largest photo.
 fn pixels(placed: &PlacedPhotos) -> usize {
     placed.photos.iter().map(|p| p.image.data.len()).max().unwrap_or(0)
 }
 
 impl<'a> Runner<'a> {
-    /// Opens the data on a machine.
+    /// Opens a data set on a device.
     pub fn open(
         device: &'a Device,
         registry: &'a Registry,
@@ -112,29 +113,26 @@ impl<'a> Runner<'a> {
         Runner { device, registry, data, truth, seed: 0, progress, store, encoders, done }
     }
 
-    /// Photos of the default row, where the user does not say.
+    /// Default number of photos: all train frames, at most as many as in the paper's runs.
     pub fn default_views(&self) -> usize {
         let train = self.truth.frames.iter().filter(|f| f.split == Split::Train).count();
         train.min(self.data.layout.views())
     }
 
-    /// The seed of what runs from now on. What the seed before the last one alone has made is
-    /// dropped.
+    /// Sets the seed of the following setups, and drops the outputs that no setup has used since
+    /// the last call.
     pub fn start_seed(&mut self, seed: u64) {
         self.store.forget_unused();
         self.done.clear();
         self.seed = seed;
     }
 
-    /// Frames whose photos a scene of so many views is made from: train frames spread over their
-    /// order, and held-out ones when they do not suffice.
+    /// Frames of the photos of a scene with `views` views: train frames spread over their order,
+    /// and held-out frames where these do not suffice.
     pub fn frames(&self, views: usize) -> Result<Vec<TruthFrame>> {
-        let of =
+        let frames_of =
             |split| -> Vec<&TruthFrame> { self.truth.frames.iter().filter(|f| f.split == split).collect() };
-        let (train, test) = (of(Split::Train), of(Split::Test));
-        let pick = |from: &[&TruthFrame], n: usize| -> Vec<TruthFrame> {
-            photo::spread(from.len(), n).into_iter().map(|i| from[i].clone()).collect()
-        };
+        let (train, test) = (frames_of(Split::Train), frames_of(Split::Test));
         if views < 2 || views > train.len() + test.len() {
             return Err(Error::input(format!(
                 "{}: {views} views of {} frames",
@@ -142,21 +140,21 @@ impl<'a> Runner<'a> {
                 train.len() + test.len()
             )));
         }
-        let mut frames = pick(&train, views.min(train.len()));
+        let mut frames = spread_frames(&train, views.min(train.len()));
         if views > train.len() {
-            frames.extend(pick(&test, views - train.len()));
+            frames.extend(spread_frames(&test, views - train.len()));
         }
         Ok(frames)
     }
 
-    /// What rows can be scored on: held-out frames that none of them has as a photo, or the photos
-    /// that all of them have.
+    /// Frames on which all rows can be scored: held-out frames that are photos of no row, or the
+    /// photos that all rows have.
     pub(super) fn scope<'r>(&self, rows: impl Iterator<Item = &'r TableRow>) -> Scope {
         let headline = self.data.layout.headline();
         let (mut seen, mut shared) = (BTreeSet::new(), None::<BTreeSet<String>>);
         for row in rows {
             let RowWork::Score(setup) = &row.runs else { continue };
-            // A row with too few frames says so when it runs.
+            // A row with too few frames fails when it runs.
             let Ok(frames) = self.frames(setup.views) else { continue };
             let stems: BTreeSet<String> = frames.into_iter().map(|f| f.stem).collect();
             shared =
@@ -164,64 +162,49 @@ impl<'a> Runner<'a> {
             seen.extend(stems);
         }
         let own = self.data.layout == Layout::Own;
-        let counts = |f: &&TruthFrame| match headline {
+        let in_scope = |f: &&TruthFrame| match headline {
             Split::Train => shared.as_ref().is_some_and(|s| s.contains(&f.stem)),
             split => !seen.contains(&f.stem) && (!own || f.split == split),
         };
-        let frames = self.truth.frames.iter().filter(counts).map(|f| f.stem.clone()).collect();
+        let frames = self.truth.frames.iter().filter(in_scope).map(|f| f.stem.clone()).collect();
         Scope { headline, frames }
     }
 
-    /// What there is to compare.
+    /// Frames and networks that tables can compare.
     pub fn available(&self) -> Available {
-        let of = |split| self.truth.frames.iter().filter(|f| f.split == split).count();
-        let there = inventory(self.registry);
-        let network = |name: &str, family: &str, fetch: Option<&String>| Network {
-            name: name.to_owned(),
-            family: family.to_owned(),
-            fetch: fetch.cloned(),
-        };
-        let networks = |task| {
-            let trained = there.models.iter().filter(|m| m.tasks.contains(&task) && !m.untrained());
-            let installed: Vec<&Installed> = trained.collect();
-            let mut all: Vec<Network> = installed.iter().map(|m| network(&m.name, &m.family, None)).collect();
-            for known in catalogue().iter().filter(|k| k.does(task)) {
-                if all.iter().all(|n| n.family != known.family) {
-                    all.push(network(&known.family, &known.family, Some(&known.id)));
-                }
-            }
-            all
-        };
+        let count = |split| self.truth.frames.iter().filter(|f| f.split == split).count();
+        let installed = inventory(self.registry).models;
         Available {
             // Half of the held-out frames must stay held out.
-            views: of(Split::Train) + of(Split::Test) / 2,
+            views: count(Split::Train) + count(Split::Test) / 2,
             cameras: self.data.layout == Layout::Own || !self.data.known.is_empty(),
-            geometry: networks(Task::Geometry),
-            matchers: networks(Task::Matcher),
-            masks: networks(Task::Masks),
-            features: networks(Task::Features),
+            geometry: networks(&installed, Task::Geometry),
+            matchers: networks(&installed, Task::Matcher),
+            masks: networks(&installed, Task::Masks),
+            features: networks(&installed, Task::Features),
         }
     }
 
-    /// The stages of a setup, up to its figures.
+    /// Builds the graph of a setup, up to its scores.
     fn stages(&mut self, setup: &Setup) -> Result<Stages> {
         let frames = self.frames(setup.views)?;
         let paths: Vec<PathBuf> = frames.iter().map(|f| self.truth.folder.join(&f.file)).collect();
         let photos = photo::load_all(&paths, self.progress)?;
         let registry = self.registry;
-        let given = |r: &Regions| matches!(r, Regions::Found { features, .. } if features.argument.is_some());
+        let given_features =
+            matches!(&setup.regions, Regions::Found { features, .. } if features.argument.is_some());
         let mut build = GraphBuilder {
             graph: Graph::default(),
             registry: registry.clone(),
             sam: SamOptions::default(),
-            given_features: given(&setup.regions),
+            given_features,
             depth_prior: sources::default::<DepthSources>(),
             preset: Preset::Draft,
             seed: self.seed,
         };
         let posed = if setup.true_cameras {
-            let named = |f: &TruthFrame| Camera { name: f.stem.clone(), ..f.camera.clone() }.into();
-            build.posed(photos, CameraOrigin::Known(frames.iter().map(named).collect::<Vec<_>>().into()))?
+            let camera = |f: &TruthFrame| Camera { name: f.stem.clone(), ..f.camera.clone() }.into();
+            build.posed(photos, CameraOrigin::Known(frames.iter().map(camera).collect::<Vec<_>>().into()))?
         } else {
             sources::make::<GeometrySources>(&setup.init, registry, (&mut build, photos))?
         };
@@ -229,13 +212,13 @@ impl<'a> Runner<'a> {
         let matches = sources::make::<MatchSources>(&setup.matcher, registry, (&mut build, posed))?;
         let options = self.rgb_options(setup);
         let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
-        let RegionData { masks, embeddings, queries, space } = self.described(setup, &mut build, posed)?;
+        let RegionData { masks, embeddings, queries, space } = self.add_regions(setup, &mut build, posed)?;
         let (recipe, seed) = (setup.recipe, self.seed);
         let aligned = build.graph.add(stages::Align { recipe, space, seed }, (masks, matches, geometry));
         let options = LanguageOptions {
             iterations: setup.language_iterations,
             seed,
-            // Every row trains equally long.
+            // No early stop: all rows train for the same number of steps.
             check_every: 0,
             ..LanguageOptions::preset(Preset::Draft)
         };
@@ -260,9 +243,8 @@ impl<'a> Runner<'a> {
         setup.recipe.rgb(options)
     }
 
-    /// Masks with features, the true embedding of every object in the space of these features, and
-    /// the questions.
-    fn described(
+    /// Adds the stages of masks with features and of the true embeddings of objects in their space.
+    fn add_regions(
         &mut self,
         setup: &Setup,
         build: &mut GraphBuilder,
@@ -301,7 +283,7 @@ impl<'a> Runner<'a> {
         Ok(RegionData { masks, embeddings, queries, space })
     }
 
-    /// True masks with synthetic features.
+    /// Adds the stages of true masks with synthetic features.
     fn synthetic(
         &self,
         flaws: InjectedErrors,
@@ -317,12 +299,12 @@ impl<'a> Runner<'a> {
         }
     }
 
-    /// An encoder, loaded once and asked once: the built-in one compares each phrase with a
-    /// thousand others.
+    /// An encoder with its queries. Both are made once, because the built-in encoder compares each
+    /// phrase with a thousand others.
     fn encoder(&mut self, choice: &SourceChoice) -> Result<&Encoder> {
         let known = self.encoders.iter().position(|e| e.choice == *choice);
-        let at = match known {
-            Some(at) => at,
+        let index = match known {
+            Some(index) => index,
             None => {
                 let encoder = sources::make::<FeatureSources>(choice, self.registry, self.registry)?;
                 let queries = encoder.with(|e| ask::embedded(&self.phrases(), e))?;
@@ -330,18 +312,17 @@ impl<'a> Runner<'a> {
                 self.encoders.len() - 1
             }
         };
-        Ok(&self.encoders[at])
+        Ok(&self.encoders[index])
     }
 
-    /// Phrases that the evaluation may ask for, in its order.
+    /// Phrases that the evaluation may query, in its order.
     fn phrases(&self) -> Vec<String> {
         let own = self.data.layout == Layout::Own;
-        let asked = |p: &&String| !own || !BACKGROUND_LABELS.contains(&p.as_str());
-        self.truth.labels.values().filter(asked).cloned().collect()
+        let is_queried = |p: &&String| !own || !BACKGROUND_LABELS.contains(&p.as_str());
+        self.truth.labels.values().filter(is_queried).cloned().collect()
     }
 
-    /// The labelled photos themselves, without a scene: features of every few pixels, asked
-    /// directly.
+    /// Scores features of the cells of labelled photos, without a scene.
     pub fn flat(&mut self, choice: &SourceChoice) -> Result<Scored> {
         let (data, truth, progress) = (self.data.clone(), self.truth.clone(), self.progress);
         let Encoder { encoder, queries, .. } = self.encoder(choice)?;
@@ -351,7 +332,7 @@ impl<'a> Runner<'a> {
         }
     }
 
-    /// Runs a setup, as far as it was not run before.
+    /// Runs the stages of a setup that did not run before; returns its results.
     pub fn outcome(&mut self, setup: &Setup) -> Result<RowFigures> {
         if let Some((_, known)) = self.done.iter().find(|(s, _)| s == setup) {
             return Ok(known.clone());
@@ -377,7 +358,7 @@ impl<'a> Runner<'a> {
         Ok(figures)
     }
 
-    /// Bytes of a setup's features in training if they were as long as the embeddings, on three
+    /// Bytes of a setup's features in training if they had the length of embeddings on three
     /// levels.
     pub fn unreduced_bytes(&mut self, setup: &Setup) -> Result<u64> {
         let s = self.stages(setup)?;
@@ -390,7 +371,30 @@ impl<'a> Runner<'a> {
     }
 }
 
-/// What [`Runner::described`] adds.
+/// Networks of a task: the trained ones that are installed, and one entry for every other known
+/// family.
+fn networks(installed: &[Installed], task: Task) -> Vec<Network> {
+    let network = |name: &str, family: &str, fetch: Option<&String>| Network {
+        name: name.to_owned(),
+        family: family.to_owned(),
+        fetch: fetch.cloned(),
+    };
+    let trained = installed.iter().filter(|m| m.tasks.contains(&task) && !m.untrained());
+    let mut all: Vec<Network> = trained.map(|m| network(&m.name, &m.family, None)).collect();
+    for known in catalogue().iter().filter(|k| k.does(task)) {
+        if all.iter().all(|n| n.family != known.family) {
+            all.push(network(&known.family, &known.family, Some(&known.id)));
+        }
+    }
+    all
+}
+
+/// `count` of the frames, spread evenly over their order.
+fn spread_frames(frames: &[&TruthFrame], count: usize) -> Vec<TruthFrame> {
+    photo::spread(frames.len(), count).into_iter().map(|i| frames[i].clone()).collect()
+}
+
+/// Outputs and queries of [`Runner::add_regions`].
 struct RegionData {
     masks: Output<Vec<ViewMasks>>,
     embeddings: Output<ObjectEmbeddings>,
@@ -406,9 +410,9 @@ mod tests {
     use splatvk::run::method::SPARSELGS;
 
     #[test]
-    fn held_out_views_that_one_row_has_as_photos_are_scored_in_none() {
+    fn scope_excludes_photos_of_any_row() {
         let (device, registry) = (splatvk::gpu::open(None).unwrap(), Registry::open(None).unwrap());
-        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast");
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/breakfast");
         let data = DataSet::open("breakfast".into(), folder.as_ref(), None).unwrap();
         let runner = Runner::open(&device, &registry, data, &Silent);
         let row = |views: usize| {

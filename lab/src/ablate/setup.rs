@@ -1,4 +1,4 @@
-//! What a row of a table takes: photos, sources, method, lengths of training.
+//! Setups of the rows of a table: photos, sources, method, steps of training.
 use serde::Serialize;
 use splatvk::run::method::Recipe;
 use splatvk::run::sources::{
@@ -6,16 +6,16 @@ use splatvk::run::sources::{
 };
 use std::path::PathBuf;
 
-/// Where cameras, matches, masks and features come from in the rows that do not vary them.
+/// Sources of cameras, matches, masks and features of the rows that do not vary them.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Sources {
-    /// Cameras and points, as `--init`.
+    /// Cameras and points, as of `--init`.
     pub init: SourceChoice,
-    /// Dense matches, as `--matcher`.
+    /// Dense matches, as of `--matcher`.
     pub matcher: SourceChoice,
-    /// As `--masks`.
+    /// Masks, as of `--masks`.
     pub masks: SourceChoice,
-    /// As `--features`.
+    /// Features, as of `--features`.
     pub features: SourceChoice,
 }
 
@@ -31,47 +31,48 @@ impl Default for Sources {
 }
 
 impl Sources {
-    /// What they find in the photos.
+    /// Regions of these sources of masks and features.
     pub fn regions(&self) -> Regions {
         Regions::Found { masks: self.masks.clone(), features: self.features.clone() }
     }
 }
 
-/// Where masks and features come from.
+/// Masks and features of a setup.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum Regions {
     /// Found in the photos, or read from a folder.
     Found {
-        /// As `--masks`.
+        /// Masks, as of `--masks`.
         masks: SourceChoice,
-        /// As `--features`.
+        /// Features, as of `--features`.
         features: SourceChoice,
     },
     /// True masks and synthetic features.
     Exact,
-    /// The same with the usual errors injected, drawn from the seed of the run.
+    /// True masks and synthetic features with errors at the default rates, drawn from the run's
+    /// seed.
     Flawed,
-    /// True masks, each with the embedding of its own label by these features' text model.
+    /// True masks, each with the embedding of its label by the text model of these features.
     TrueSegmentation {
-        /// As `--features`.
+        /// Features, as of `--features`.
         features: SourceChoice,
     },
 }
 
 impl Regions {
-    /// What `splatvk run` uses on its own.
+    /// Default masks and features of `splatvk run`.
     pub fn built_in() -> Regions {
         Sources::default().regions()
     }
 
-    /// Masks and features from a folder.
+    /// Masks and features of a folder.
     pub fn given(dir: PathBuf) -> Regions {
         Regions::Found { masks: SourceChoice::with("dir", &dir), features: SourceChoice::with("dir", dir) }
     }
 
-    /// For the rows of a table.
+    /// Name as the group of a table's rows.
     pub fn name(&self) -> String {
         match self {
             regions if *regions == Regions::built_in() => "built-in".into(),
@@ -84,18 +85,18 @@ impl Regions {
     }
 }
 
-/// Everything that a row decides.
+/// Options of a row.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Setup {
-    /// Photos.
+    /// Number of photos.
     pub views: usize,
-    /// Cameras and points.
+    /// Source of cameras and points.
     pub init: SourceChoice,
-    /// The true cameras of the data set, and stereo, instead of `init`.
+    /// Whether the true cameras of the data set, with stereo, replace `init`.
     pub true_cameras: bool,
-    /// Dense matches for the alignment.
+    /// Source of dense matches for the alignment.
     pub matcher: SourceChoice,
-    /// Most stereo points that splats start from; none = the preset's.
+    /// Maximum of stereo points that splats start from; `None`: the preset's.
     pub max_points: Option<usize>,
     /// Masks and features.
     pub regions: Regions,
@@ -107,71 +108,72 @@ pub struct Setup {
     pub language_iterations: usize,
 }
 
-/// What a row takes.
+/// Work of a row.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub enum RowWork {
-    /// All of it, scored.
+    /// Makes the scene of a setup and scores it.
     Score(Setup),
-    /// Nothing is trained: the bytes that features of full length would take are stated.
+    /// Trains no features; computes the bytes that features of full length would take.
     MemoryOnly(Setup),
-    /// No scene: every few pixels of the scored photos are described by these features and asked
-    /// directly.
+    /// Makes no scene; scores these features of the cells of labelled photos.
     Flat(SourceChoice),
-    /// Nothing; the note says why.
+    /// No work; the note gives the reason.
     Nothing,
 }
 
-/// One row before it ran.
+/// A row of a table before it runs.
 #[derive(Clone, Debug)]
 pub struct TableRow {
-    /// What this row is, within its group.
+    /// Name of the row in its group.
     pub label: String,
-    /// Rows are compared within their group.
+    /// Group; rows are compared within their group.
     pub group: String,
-    /// What to run.
+    /// Work of the row.
     pub runs: RowWork,
-    /// What the reader should know about this row.
+    /// Remark for the reader.
     pub note: String,
 }
 
 /// A network that a table compares.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Network {
-    /// As the options call it: its own name where it is installed, else that of its family.
+    /// Name on the command line: its own where it is installed, else that of its family.
     pub name: String,
-    /// What several networks of one kind share.
+    /// Family of networks.
     pub family: String,
-    /// What `splatvk models fetch` calls it, where no trained one of its family is on this machine.
+    /// Id for `splatvk models fetch` where no trained network of the family is installed.
     pub fetch: Option<String>,
 }
 
-/// What a machine and a data set have for the tables to compare.
+/// Data and networks that the tables can compare. Each list of networks holds the installed ones,
+/// and one entry for every known family without an installed network.
 #[derive(Clone, Debug, Default)]
 pub struct Available {
-    /// Frames that may be photos.
+    /// Number of frames that may be photos.
     pub views: usize,
-    /// True cameras are known.
+    /// Whether true cameras are known.
     pub cameras: bool,
-    /// Every installed network, and every known family of which none is.
+    /// Networks for geometry.
     pub geometry: Vec<Network>,
-    /// The same for dense matches.
+    /// Networks for dense matches.
     pub matchers: Vec<Network>,
-    /// The same for masks.
+    /// Networks for masks.
     pub masks: Vec<Network>,
-    /// The same for features.
+    /// Networks for features.
     pub features: Vec<Network>,
 }
 
 /// Rows under the same regions.
 pub(super) struct Group<'a> {
-    /// The default of the rows.
+    /// Default setup of the rows.
     pub(super) base: Setup,
     pub(super) sources: &'a Sources,
     pub(super) available: &'a Available,
 }
 
 impl Group<'_> {
+    /// A row that scores a setup.
     pub(super) fn row(&self, label: &str, setup: Setup) -> TableRow {
         TableRow {
             label: label.to_owned(),
@@ -181,12 +183,13 @@ impl Group<'_> {
         }
     }
 
+    /// A row that scores the default setup with another recipe.
     pub(super) fn recipe(&self, label: &str, recipe: Recipe) -> TableRow {
         self.row(label, Setup { recipe, ..self.base.clone() })
     }
 
-    /// A row for the source that needs no network, one for every network that is installed, and one
-    /// that says how to get it for every other.
+    /// Rows of the default source and of every network; those of networks that are not installed
+    /// have a note with the command that installs them.
     pub(super) fn each<K: SourceKind>(
         &self,
         networks: &[Network],
@@ -201,7 +204,8 @@ impl Group<'_> {
         rows
     }
 
-    /// A network has a row also where it is not, which says so.
+    /// Returns the row, or a row without work and with an installation note where the network is
+    /// not installed.
     pub(super) fn if_installed(&self, row: TableRow, network: &Network) -> TableRow {
         match &network.fetch {
             None => row,
@@ -212,7 +216,7 @@ impl Group<'_> {
         }
     }
 
-    /// The same with the reason why it cannot run here.
+    /// Returns the row without work; its note is the reason.
     pub(super) fn impossible(row: TableRow, note: String) -> TableRow {
         TableRow { runs: RowWork::Nothing, note, ..row }
     }

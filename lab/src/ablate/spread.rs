@@ -1,20 +1,20 @@
-//! Means over scenes and seeds, and whether a difference between two rows is more than chance.
+//! Means over scenes and seeds, and the significance of differences between rows.
 use serde::Serialize;
 use std::collections::BTreeMap;
 
-/// A figure over scenes and seeds.
+/// Mean and standard deviation of a figure over scenes and seeds.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Spread {
     /// Mean.
     pub mean: f64,
-    /// Standard deviation over scenes and seeds; none of a single value.
+    /// Sample standard deviation over scenes and seeds; `None` for a single value.
     pub sd: Option<f64>,
-    /// Values.
+    /// Number of values.
     pub n: usize,
 }
 
 impl Spread {
-    /// Of values; `None` without any.
+    /// Computes mean and standard deviation of values; `None` without values.
     pub fn of(values: &[f64]) -> Option<Spread> {
         let n = values.len();
         let mean = values.iter().sum::<f64>() / n as f64;
@@ -24,21 +24,20 @@ impl Spread {
     }
 }
 
-/// How a row differs from the row that it is compared with, on the same scenes and seeds.
+/// Difference of a row from its reference row, on the same scenes and seeds.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Difference {
-    /// Mean over scenes of their mean over seeds.
+    /// Mean over scenes of the means over seeds.
     pub mean: f64,
-    /// Half of the 95 % interval for scenes of this kind; none of a single scene, which says
-    /// nothing of others.
+    /// Half of the 95 % confidence interval for scenes of this kind; `None` for a single scene.
     pub half: Option<f64>,
-    /// Scenes.
+    /// Number of scenes.
     pub scenes: usize,
 }
 
 impl Difference {
-    /// Of differences as (scene, value). Seeds of one scene are no independent scenes: they are
-    /// averaged first.
+    /// Summarises differences given as (scene, value). Seeds of one scene are averaged first,
+    /// because they are not independent scenes.
     pub fn of(values: &[(&str, f64)]) -> Option<Difference> {
         let mut scenes: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
         values.iter().for_each(|(scene, v)| scenes.entry(scene).or_default().push(*v));
@@ -47,14 +46,14 @@ impl Difference {
         Some(Difference { mean, half: sd.map(|sd| student(n - 1) * sd / (n as f64).sqrt()), scenes: n })
     }
 
-    /// Whether scenes of this kind differ for certain enough to say so.
+    /// Whether the 95 % confidence interval excludes zero.
     pub fn is_decided(&self) -> bool {
         self.half.is_some_and(|half| self.mean.abs() > half)
     }
 }
 
-/// 97.5 % quantile of Student's t (Student 1908): exact to a hundredth for up to ten degrees of
-/// freedom, Fisher's expansion in their reciprocal above.
+/// 97.5 % quantile of Student's t (Student 1908): a table with three decimals up to ten degrees of
+/// freedom, above that Fisher's expansion in their reciprocal.
 fn student(freedom: usize) -> f64 {
     const TABLE: [f64; 10] = [12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228];
     let z = 1.959_964f64;
@@ -72,7 +71,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_spread_is_that_of_a_sample() {
+    fn spread_uses_sample_deviation() {
         let s = Spread::of(&[1.0, 2.0, 4.0]).unwrap();
         assert!((s.mean - 7.0 / 3.0).abs() < 1e-12 && (s.sd.unwrap() - (7.0f64 / 3.0).sqrt()).abs() < 1e-12);
         assert_eq!(Spread::of(&[5.0]).unwrap(), Spread { mean: 5.0, sd: None, n: 1 });
@@ -80,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn seeds_of_one_scene_do_not_make_a_difference_more_certain() {
+    fn difference_averages_seeds_of_scene() {
         let scenes = [("a", 0.1), ("b", 0.2), ("c", 0.3)];
         let once = Difference::of(&scenes).unwrap();
         let thrice: Vec<(&str, f64)> = scenes.iter().flat_map(|s| [*s; 3]).collect();
@@ -93,7 +92,7 @@ mod tests {
     }
 
     #[test]
-    fn student_s_quantiles_join() {
+    fn student_matches_known_quantiles() {
         assert!((student(11) - 2.201).abs() < 2e-3 && (student(30) - 2.042).abs() < 1e-3);
         assert!((student(1000) - 1.962).abs() < 1e-3);
     }

@@ -1,10 +1,10 @@
-//! What only experiments do: masks and features from ground truth, the true embeddings of objects,
-//! and figures.
+//! Stages of experiments: masks and features from ground truth, true embeddings of objects, and
+//! figures.
 use super::data::DataSet;
 use crate::generate::regions::{self, InjectedErrors};
+use crate::protocol::{self, CodeScores, DecodedView, ProtocolKind, ProtocolReport};
 use crate::{Error, Result};
 use serde::Serialize;
-use splatvk::eval::protocol::{self, CodeScores, DecodedView, ProtocolKind, ProtocolReport};
 use splatvk::eval::{EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
 use splatvk::fit::{Trained, TrainedLanguage};
 use splatvk::language::{LevelMasks, ViewMasks, dir};
@@ -25,38 +25,38 @@ pub(super) type ObjectEmbeddings = BTreeMap<u32, Vec<f32>>;
 /// Agreement of decoded embeddings with the true ones in one frame.
 #[derive(Clone, Debug, Serialize)]
 pub struct EmbeddingAgreement {
-    /// Frame file stem.
+    /// File stem of the frame.
     pub frame: String,
-    /// Held out or not.
+    /// Split of the frame.
     pub split: Split,
     /// Mean cosine over labelled pixels.
     pub similarity: f64,
-    /// Mean square difference with every coordinate scaled to [0, 1] over the true embeddings.
+    /// Mean square difference, with every coordinate scaled to [0, 1] over the true embeddings.
     pub mse: f64,
 }
 
-/// The figures of a scene.
+/// Figures of a scene.
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
 pub struct Scored {
-    /// Of protocol `field`.
+    /// Figures of protocol `field`; empty where the data set has a published layout.
     pub report: EvalReport,
-    /// Of the published protocol instead, where the data set follows one.
+    /// Figures of the published protocol of the data set's layout.
     pub published: Option<ProtocolReport>,
-    /// Per frame.
+    /// Agreement of embeddings, per frame.
     pub agreement: Vec<EmbeddingAgreement>,
 }
 
-/// The frame of each photo.
+/// Ground-truth frame of each photo.
 fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t TruthFrame>> {
-    let find = |p: &Photo| {
+    let frame_of = |p: &Photo| {
         let frame = truth.frames.iter().find(|f| stem(&f.file) == p.stem);
         frame.ok_or_else(|| Error::work(format!("{}: not a frame of the data set", p.path.display())))
     };
-    photos.iter().map(find).collect()
+    photos.iter().map(frame_of).collect()
 }
 
-/// True masks with synthetic features.
+/// Makes true masks with synthetic features.
 pub(super) struct SyntheticMasks {
     pub(super) truth: Arc<GroundTruth>,
     pub(super) flaws: InjectedErrors,
@@ -77,7 +77,7 @@ impl Stage for SyntheticMasks {
     }
 }
 
-/// What objects mean in the space of [`SyntheticMasks`].
+/// Makes the true embeddings of objects in the space of [`SyntheticMasks`].
 pub(super) struct SyntheticEmbeddings {
     pub(super) truth: Arc<GroundTruth>,
     pub(super) flaws: InjectedErrors,
@@ -98,7 +98,7 @@ impl Stage for SyntheticEmbeddings {
     }
 }
 
-/// Embedding of each object's true mask by an encoder, averaged over the photos.
+/// Computes each object's embedding of its true mask by an encoder, averaged over the photos.
 pub(super) struct EncoderEmbeddings {
     pub(super) truth: Arc<GroundTruth>,
     pub(super) encoder: SharedEncoder,
@@ -133,7 +133,7 @@ impl Stage for EncoderEmbeddings {
     }
 }
 
-/// Embedding of each object by the given masks of level l, averaged over its pixels.
+/// Computes each object's embedding from the given masks of level l, averaged over its pixels.
 pub(super) struct MaskEmbeddings {
     pub(super) truth: Arc<GroundTruth>,
 }
@@ -169,10 +169,10 @@ impl Stage for MaskEmbeddings {
     }
 }
 
-/// Asks the finished scene for every object in every frame.
+/// Queries the finished scene for every object in every frame, by protocol `field`.
 pub(super) struct Score {
     pub(super) truth: Arc<GroundTruth>,
-    /// The evaluation's phrases, in its order.
+    /// Queries of the evaluation's phrases, in its order.
     pub(super) queries: Vec<TextQuery>,
 }
 
@@ -183,7 +183,7 @@ impl Stage for Score {
     type Output = Scored;
 
     fn settings(&self) -> String {
-        // The space of the queries is that of the language.
+        // The queries are of the space of the language, which is an input.
         format!("{:?}", self.truth.folder)
     }
 
@@ -223,11 +223,11 @@ impl Stage for Score {
     }
 }
 
-/// The same by a published protocol.
+/// Scores the finished scene by a published protocol.
 pub(super) struct ScorePublished {
     pub(super) data: Arc<DataSet>,
     pub(super) kind: ProtocolKind,
-    /// Of every phrase that the data set labels.
+    /// Queries of every phrase that the data set labels.
     pub(super) queries: Vec<TextQuery>,
 }
 
@@ -248,7 +248,7 @@ impl Stage for ScorePublished {
     ) -> Result<Scored> {
         let truth = &self.data.truth;
         let mut protocol = protocol::open(self.kind, &self.data.labels, &trained.cameras, &self.data.known)?;
-        let queries = asked(&protocol.prompts(), &self.queries);
+        let queries = queries_for(&protocol.prompts(), &self.queries);
         let scores = CodeScores::new(&language.field, &queries)?;
         let mut viewer = Viewer::new(context.device, &language.splats, &language.field)?;
         let (levels, scale) = (&language.field.levels, Scale::of(embeddings));
@@ -276,17 +276,17 @@ impl Stage for ScorePublished {
     }
 }
 
-/// The queries of these texts.
-pub(super) fn asked(texts: &[String], queries: &[TextQuery]) -> Vec<TextQuery> {
+/// The queries of these texts, in their order; texts without a query are left out.
+pub(super) fn queries_for(texts: &[String], queries: &[TextQuery]) -> Vec<TextQuery> {
     texts.iter().filter_map(|text| queries.iter().find(|q| q.text == *text)).cloned().collect()
 }
 
-/// What pixels are that carry no label. As nobody's, they would take the codes of the things beside
-/// them.
+/// Text of pixels without a label. Left without a mask, they would take the codes of neighbouring
+/// objects.
 const UNLABELLED: &str = "background";
 
-/// True masks on every level, each with the embedding of its label's text; what has no label is one
-/// more mask.
+/// Makes true masks on every level, each with the embedding of its label's text; pixels without a
+/// label are one more mask.
 pub(super) struct LabelledMasks {
     pub(super) truth: Arc<GroundTruth>,
     pub(super) encoder: SharedEncoder,
@@ -330,7 +330,7 @@ impl Stage for LabelledMasks {
     }
 }
 
-/// What labels mean where [`LabelledMasks`] say so.
+/// Embeds the texts of the labels, in the space of [`LabelledMasks`].
 pub(super) struct LabelEmbeddings {
     pub(super) truth: Arc<GroundTruth>,
     pub(super) encoder: SharedEncoder,
@@ -372,7 +372,7 @@ impl Sums {
         let sum = self.rows.entry(label).or_insert_with(|| vec![0.0; self.dim]);
         sum.iter_mut().zip(row).for_each(|(s, v)| *s += weight * v);
     }
-    /// Unit vectors of those that are not zero.
+    /// Normalises the sums and drops those that are zero.
     fn unit(mut self) -> ObjectEmbeddings {
         self.rows.values_mut().for_each(|row| dir::normalise_rows(row, self.dim));
         self.rows.retain(|_, row| row.iter().any(|v| *v != 0.0));
@@ -380,24 +380,25 @@ impl Sums {
     }
 }
 
-/// 1 / (max − min) per coordinate over the true embeddings, squared; 0 where they do not differ.
+/// Squared reciprocal of (max − min) per coordinate over the true embeddings; 0 where they do not
+/// differ.
 struct Scale(Vec<f32>);
 
 impl Scale {
     fn of(embeddings: &ObjectEmbeddings) -> Self {
         let dim = embeddings.values().next().map_or(0, Vec::len);
-        let scale = |c: usize| {
+        let coordinate_scale = |c: usize| {
             let (low, high) =
                 embeddings.values().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(v[c]), h.max(v[c])));
-            // Coordinates of unit vectors that differ by less than this differ by rounding.
+            // Smaller differences of coordinates of unit vectors are rounding.
             if high - low > 1e-4 { 1.0 / (high - low).powi(2) } else { 0.0 }
         };
-        Scale((0..dim).map(scale).collect())
+        Scale((0..dim).map(coordinate_scale).collect())
     }
 }
 
-/// How well a decoded level agrees with the true embedding of each pixel's object; pixels without
-/// code or truth are left out.
+/// Agreement of a decoded level with the true embedding of each pixel's object; pixels without a
+/// code or an embedding are left out.
 fn agreement(
     frame: &TruthFrame,
     codes: &Image<i32>,
@@ -407,11 +408,12 @@ fn agreement(
     scale: &Scale,
 ) -> Option<EmbeddingAgreement> {
     let mut pairs: BTreeMap<(i32, u32), usize> = BTreeMap::new();
-    // The decoded pixel under the centre of each labelled one, where sizes differ.
-    let at = |k: usize, from: usize, to: usize| ((2 * k + 1) * to / (2 * from)).min(to - 1);
+    // Index of the decoded pixel at the centre of labelled pixel `k`, along an axis; sizes differ.
+    let decoded_index = |k: usize, from: usize, to: usize| ((2 * k + 1) * to / (2 * from)).min(to - 1);
     for (p, &o) in objects.data.iter().enumerate() {
         let (x, y) = (p % objects.width, p / objects.width);
-        let k = codes.at(at(x, objects.width, codes.width), at(y, objects.height, codes.height));
+        let column = decoded_index(x, objects.width, codes.width);
+        let k = codes.at(column, decoded_index(y, objects.height, codes.height));
         if k >= 0 {
             *pairs.entry((k, o)).or_default() += 1;
         }

@@ -1,4 +1,4 @@
-//! Measurements of a table as text, JSON and a chart.
+//! Finished tables as text, JSON and a chart.
 use super::data::{DataSet, Layout};
 use super::measure::Measurement;
 use super::paper;
@@ -9,25 +9,25 @@ use splatvk::report::chart::{Bar, bar_chart};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
-/// The figure that rows are compared by.
+/// Column by which rows are compared.
 const HEADLINE: &str = "mIoU";
 
 /// A row over all scenes and seeds.
 #[derive(Clone, Debug)]
 pub struct FinishedRow {
-    /// Rows are compared within their group.
+    /// Group; rows are compared within their group.
     pub group: String,
-    /// What this row is.
+    /// Name of the row in its group.
     pub label: String,
-    /// What the reader should know, failures included.
+    /// Remarks for the reader, failures included.
     pub note: String,
-    /// By column.
+    /// Figures by column.
     pub figures: BTreeMap<String, Spread>,
-    /// mIoU against the group's row of reference; none for that row itself.
+    /// Difference in mIoU from the group's reference row; `None` for that row itself.
     pub difference: Option<Difference>,
-    /// The paper's figures for this row, by column.
+    /// The paper's figures of this row, by column.
     pub paper: Vec<(&'static str, f64)>,
-    /// One setup of the row, as JSON.
+    /// Setup of the first measurement, as JSON.
     setup: Value,
     /// mIoU by scene, and the paper's.
     by_scene: BTreeMap<String, Spread>,
@@ -39,18 +39,19 @@ pub struct FinishedRow {
 /// A table over all scenes and seeds.
 #[non_exhaustive]
 pub struct FinishedTable {
-    /// Which.
+    /// The table.
     pub table: &'static Table,
     /// Rows in order.
     pub rows: Vec<FinishedRow>,
+    /// Whether there is more than one scene or seed.
     several: bool,
 }
 
-/// Columns of every table, around its own.
+/// Columns of every table, before and after its own.
 const FIRST: [Column; 2] = [(HEADLINE, 3), ("mAcc", 3)];
 const LAST: [Column; 4] = [("mIoU photos", 3), ("mIoU held out", 3), ("Tr.T", 0), ("T.T", 0)];
 
-/// Where the paper's figures beside a table come from.
+/// Data sets that select the paper's figures of a table.
 #[derive(Clone, Debug)]
 pub struct PaperSet {
     layout: Layout,
@@ -58,55 +59,58 @@ pub struct PaperSet {
 }
 
 impl PaperSet {
-    /// For these data sets, which are all of one layout.
+    /// Selects the figures of data sets of one layout.
     pub fn of<'s>(layout: Layout, sets: impl Iterator<Item = &'s DataSet>) -> PaperSet {
         PaperSet { layout, scenes: sets.map(|s| s.name.clone()).collect() }
     }
 
+    /// Name of a scene in the paper's figures.
     fn scene(&self, name: &str) -> String {
-        // Our own scenes are none of the paper's, whatever they are called.
+        // Scenes of layout `own` are not the paper's, even with the same name.
         let set = if self.layout == Layout::Own { "own" } else { self.layout.paper() };
         format!("{set}/{}", name.rsplit('/').next().unwrap_or(name))
     }
 
-    /// A row's figures: of the scene, where there is one, of the whole data set, or of the one
-    /// scene that the paper shows.
+    /// The paper's figures of a row: those of the scene if there is only one, else of the data set,
+    /// else of the scene that the paper shows.
     fn figures(&self, table: &str, row: &str) -> Vec<(&'static str, f64)> {
         let set = self.layout.paper();
-        let mut places = vec![set.to_owned(), format!("{set}/teatime")];
+        let mut names = vec![set.to_owned(), format!("{set}/teatime")];
         if let [scene] = &self.scenes[..] {
-            places.insert(0, self.scene(scene));
+            names.insert(0, self.scene(scene));
         }
-        paper::figures(table, row, &places)
+        paper::figures(table, row, &names)
     }
 
-    /// mIoU of a row by scene, for those that the paper has.
+    /// The paper's mIoU of a row by scene, for the scenes that it has.
     fn by_scene(&self, table: &str, row: &str) -> BTreeMap<String, f64> {
-        let of = |scene: &String| {
+        let miou = |scene: &String| {
             let all = paper::figures(table, row, &[self.scene(scene)]);
             Some((scene.clone(), all.iter().find(|f| f.0 == HEADLINE)?.1))
         };
-        self.scenes.iter().filter_map(of).collect()
+        self.scenes.iter().filter_map(miou).collect()
     }
 }
 
 /// Values per key of the entries of all measurements.
 fn gathered<'m>(
-    of: &[&'m Measurement],
+    measurements: &[&'m Measurement],
     entries: fn(&'m Measurement) -> &'m BTreeMap<String, f64>,
 ) -> BTreeMap<String, Vec<f64>> {
     let mut all: BTreeMap<String, Vec<f64>> = BTreeMap::new();
-    for (name, value) in of.iter().flat_map(|m| entries(m)) {
+    for (name, value) in measurements.iter().flat_map(|m| entries(m)) {
         all.entry(name.clone()).or_default().push(*value);
     }
     all
 }
 
+/// Spread of the values of each key.
+fn spreads(all: BTreeMap<String, Vec<f64>>) -> BTreeMap<String, Spread> {
+    all.into_iter().filter_map(|(name, values)| Some((name, Spread::of(&values)?))).collect()
+}
+
 impl FinishedRow {
     fn of(row: &[&Measurement], reference: Option<&[&Measurement]>, paper: &PaperSet) -> Self {
-        let spreads = |all: BTreeMap<String, Vec<f64>>| -> BTreeMap<String, Spread> {
-            all.into_iter().filter_map(|(name, values)| Some((name, Spread::of(&values)?))).collect()
-        };
         let mut scenes: BTreeMap<String, Vec<f64>> = BTreeMap::new();
         for m in row {
             scenes.entry(m.data.clone()).or_default().extend(m.figures.get(HEADLINE));
@@ -131,6 +135,7 @@ impl FinishedRow {
         }
     }
 
+    /// Text of a column: mean, standard deviation, and the paper's figure in brackets.
     fn cell(&self, (name, decimals): Column) -> String {
         let paper = self.paper.iter().find(|p| p.0 == name);
         let bracket = paper.map_or(String::new(), |p| format!(" ({:.decimals$})", p.1));
@@ -143,7 +148,19 @@ impl FinishedRow {
         }
     }
 
-    /// Difference and interval, and whether that decides anything.
+    fn json(&self) -> Value {
+        let map = |entries: Vec<(String, Value)>| Value::Object(entries.into_iter().collect::<Map<_, _>>());
+        let means = self.figures.iter().map(|(k, s)| (k.clone(), json!(s.mean)));
+        let paper = self.paper.iter().map(|p| (p.0.to_owned(), json!(p.1)));
+        json!({
+            "group": self.group, "label": self.label, "note": self.note, "setup": self.setup,
+            "figures": map(means.collect()), "spread": self.figures, "difference": self.difference,
+            "decided": self.difference.map(|d| d.is_decided()), "paper": map(paper.collect()),
+            "scenes": self.by_scene, "paper_scenes": self.paper_by_scene, "iou": self.iou,
+        })
+    }
+
+    /// Text of the difference with its interval, and "open" where the interval holds zero.
     fn compared(&self) -> String {
         match &self.difference {
             Some(d @ Difference { mean, half: Some(half), .. }) => {
@@ -155,7 +172,7 @@ impl FinishedRow {
     }
 }
 
-/// The notes of a row, and how many of its runs failed, with the first reason.
+/// Distinct notes of a row, and the number of its failures with the first reason.
 fn note(row: &[&Measurement]) -> String {
     let failed: Vec<&&Measurement> = row.iter().filter(|m| m.failed).collect();
     let mut notes: Vec<String> = Vec::new();
@@ -174,7 +191,7 @@ fn note(row: &[&Measurement]) -> String {
 }
 
 impl FinishedTable {
-    /// Of all measurements those of a table.
+    /// Summarises the measurements of a table among all measurements.
     pub fn of(table: &'static Table, all: &[Measurement], paper: &PaperSet) -> FinishedTable {
         let own: Vec<&Measurement> = all.iter().filter(|m| m.table == table.name).collect();
         let mut keys: Vec<(&str, &str)> = Vec::new();
@@ -183,14 +200,14 @@ impl FinishedTable {
                 keys.push((&m.group, &m.label));
             }
         }
-        // Groups stay together where scenes differ in the rows that they have.
+        // Keeps groups together where scenes have different rows.
         let order: Vec<&str> = keys.iter().map(|k| k.0).collect();
         keys.sort_by_key(|k| order.iter().position(|g| *g == k.0));
         let rows = keys.iter().map(|(group, label)| {
             let row: Vec<&Measurement> =
                 own.iter().filter(|m| m.group == *group && m.label == *label).copied().collect();
-            let of_group = own.iter().filter(|m| m.group == *group && m.reference).copied();
-            let reference: Vec<&Measurement> = of_group.collect();
+            let reference: Vec<&Measurement> =
+                own.iter().filter(|m| m.group == *group && m.reference).copied().collect();
             let differs = !row.iter().any(|m| m.reference);
             FinishedRow::of(&row, differs.then_some(&reference), paper)
         });
@@ -198,18 +215,16 @@ impl FinishedTable {
         FinishedTable { table, rows: rows.collect(), several: runs.len() > 1 }
     }
 
-    /// Those that any row has a figure for.
+    /// Columns that have a figure in at least one row.
     fn columns(&self) -> Vec<Column> {
         let all = FIRST.iter().chain(self.table.columns).chain(&LAST).copied();
-        let any = |name: &str| {
-            let of =
-                |row: &FinishedRow| row.figures.contains_key(name) || row.paper.iter().any(|p| p.0 == name);
-            self.rows.iter().any(of)
+        let has_figure = |row: &FinishedRow, name: &str| {
+            row.figures.contains_key(name) || row.paper.iter().any(|p| p.0 == name)
         };
-        all.filter(|c| any(c.0)).collect()
+        all.filter(|c| self.rows.iter().any(|row| has_figure(row, c.0))).collect()
     }
 
-    /// As text, the paper's figure in brackets beside ours.
+    /// Table as text, with the paper's figures in brackets.
     pub fn text(&self) -> String {
         let columns = self.columns();
         let names = columns.iter().map(|c| c.0.to_owned());
@@ -241,23 +256,12 @@ impl FinishedTable {
         text
     }
 
-    /// Everything, for other programs.
+    /// Table as JSON, with all figures.
     pub fn json(&self) -> Value {
-        let map = |entries: Vec<(String, Value)>| Value::Object(entries.into_iter().collect::<Map<_, _>>());
-        let row = |row: &FinishedRow| {
-            let means = row.figures.iter().map(|(k, s)| (k.clone(), json!(s.mean)));
-            let paper = row.paper.iter().map(|p| (p.0.to_owned(), json!(p.1)));
-            json!({
-                "group": row.group, "label": row.label, "note": row.note, "setup": row.setup,
-                "figures": map(means.collect()), "spread": row.figures, "difference": row.difference,
-                "decided": row.difference.map(|d| d.is_decided()), "paper": map(paper.collect()),
-                "scenes": row.by_scene, "paper_scenes": row.paper_by_scene, "iou": row.iou,
-            })
-        };
-        json!({ "table": self.table, "rows": self.rows.iter().map(row).collect::<Vec<_>>() })
+        json!({ "table": self.table, "rows": self.rows.iter().map(FinishedRow::json).collect::<Vec<_>>() })
     }
 
-    /// mIoU of every row as bars with its spread, the paper's as a tick.
+    /// Bar chart of the mIoU of every row with its standard deviation; ticks are the paper's.
     pub fn svg(&self) -> String {
         let bar = |row: &FinishedRow| {
             let Spread { mean, sd, .. } = *row.figures.get(HEADLINE)?;
@@ -274,7 +278,7 @@ impl FinishedTable {
     }
 }
 
-/// Columns as wide as their widest cell; lines of one cell are headings.
+/// Pads columns to their widest cell; lines of one cell are headings.
 fn aligned(cells: &[Vec<String>]) -> String {
     let wide = cells.iter().filter(|l| l.len() > 1);
     let count = cells.first().map_or(0, Vec::len);
@@ -283,12 +287,12 @@ fn aligned(cells: &[Vec<String>]) -> String {
     let widths: Vec<usize> = (0..count).map(width).collect();
     let mut text = String::new();
     for line in cells {
-        let cell = |(c, s): (usize, &String)| match widths.get(c) {
+        let pad = |(c, s): (usize, &String)| match widths.get(c) {
             Some(&w) if c > 0 => format!("{s:>w$}"),
             Some(&w) if line.len() > 1 => format!("{s:<w$}"),
             _ => s.clone(),
         };
-        let padded: Vec<String> = line.iter().enumerate().map(cell).collect();
+        let padded: Vec<String> = line.iter().enumerate().map(pad).collect();
         // Writing to a String cannot fail.
         let _ = writeln!(text, "{}", padded.join("  ").trim_end());
     }
@@ -299,7 +303,7 @@ fn aligned(cells: &[Vec<String>]) -> String {
 mod tests {
     use super::*;
     use crate::ablate::tables::table;
-    use splatvk::eval::protocol::ProtocolKind;
+    use crate::protocol::ProtocolKind;
 
     fn measured(data: &str, seed: u64, label: &str, miou: Option<f64>) -> Measurement {
         Measurement {
@@ -323,7 +327,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_are_means_over_scenes_and_seeds_and_are_compared_pair_by_pair() {
+    fn finished_rows_compare_pairs_of_measurements() {
         let mut all = Vec::new();
         for (scene, ours) in [("a", 0.9), ("b", 0.5), ("c", 0.7)] {
             for seed in 0..2 {
@@ -336,7 +340,7 @@ mod tests {
         let done = finished(&all);
         let (none, reference) = (&done.rows[0], &done.rows[1]);
         assert!((none.figures["mIoU"].mean - 0.605).abs() < 1e-9 && none.figures["mIoU"].n == 6);
-        // Scenes differ by 0.2, the rows by 0.1 in every one of them.
+        // Scenes differ by 0.2, the rows by 0.1 in every scene.
         let d = none.difference.unwrap();
         assert!((d.mean + 0.1).abs() < 1e-9 && d.is_decided() && d.scenes == 3, "{d:?}");
         assert!(none.figures["mIoU"].sd.unwrap() > 0.15 && reference.difference.is_none());
@@ -353,29 +357,25 @@ mod tests {
     }
 
     #[test]
-    fn the_paper_s_figures_are_those_of_the_scenes_at_hand() {
-        let of = |layout, scenes: &[&str], table: &str, row: &str| {
+    fn paper_set_selects_figures_of_scenes() {
+        let paper = |layout, scenes: &[&str], table: &str, row: &str| {
             let scenes = scenes.iter().map(|s| (*s).to_owned()).collect();
             let set = PaperSet { layout, scenes };
             (set.figures(table, row).first().map(|f| f.1), set.by_scene(table, row).len())
         };
         let lerf = Layout::Published(ProtocolKind::Lerf);
-        assert_eq!(of(lerf, &["teatime"], "methods", "sparselgs"), (Some(0.713), 1));
-        assert_eq!(of(lerf, &["teatime", "ramen", "mine"], "methods", "sparselgs"), (Some(0.538), 2));
-        assert_eq!(of(lerf, &["teatime", "ramen"], "views", "2 views").0, Some(0.7341));
-        assert_eq!(of(Layout::Own, &["teatime"], "methods", "sparselgs"), (Some(0.538), 0));
-        assert_eq!(
-            of(Layout::Published(ProtocolKind::ScanNet), &["a"], "feed-forward", "lsm").0,
-            Some(0.4709)
-        );
-        assert_eq!(
-            of(Layout::Published(ProtocolKind::Ovs), &["x/room"], "methods", "langsplat").0,
-            Some(0.004)
-        );
+        assert_eq!(paper(lerf, &["teatime"], "methods", "sparselgs"), (Some(0.713), 1));
+        assert_eq!(paper(lerf, &["teatime", "ramen", "mine"], "methods", "sparselgs"), (Some(0.538), 2));
+        assert_eq!(paper(lerf, &["teatime", "ramen"], "views", "2 views").0, Some(0.7341));
+        assert_eq!(paper(Layout::Own, &["teatime"], "methods", "sparselgs"), (Some(0.538), 0));
+        let scannet = Layout::Published(ProtocolKind::ScanNet);
+        assert_eq!(paper(scannet, &["a"], "feed-forward", "lsm").0, Some(0.4709));
+        let ovs = Layout::Published(ProtocolKind::Ovs);
+        assert_eq!(paper(ovs, &["x/room"], "methods", "langsplat").0, Some(0.004));
     }
 
     #[test]
-    fn one_run_has_no_spread() {
+    fn finished_table_of_one_run_has_no_spread() {
         let done = finished(&[measured("a", 0, "step 1", Some(0.8)), measured("a", 0, "step 3", None)]);
         let text = done.text();
         assert!(

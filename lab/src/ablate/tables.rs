@@ -9,17 +9,17 @@ use splatvk::run::sources::{FeatureSources, GeometrySources, MaskSources, MatchS
 /// Column name, decimals.
 pub(super) type Column = (&'static str, usize);
 
-/// A table: what it varies, under which regions, and what it shows.
+/// A table of experiments: its columns, its rows, and the regions under which they run.
 pub struct Table {
-    /// As the command line spells it.
+    /// Name on the command line.
     pub name: &'static str,
-    /// What it compares.
+    /// Help text: the compared setups.
     pub about: &'static str,
-    /// Figures beside mIoU and mAcc.
+    /// Columns beside mIoU and mAcc.
     pub(super) columns: &'static [Column],
-    /// The regions under which it is run when the user does not say; one group of rows each.
+    /// Default regions; each makes one group of rows.
     pub(super) regions: fn(&Sources, &Available) -> Vec<Regions>,
-    /// The rows of a group.
+    /// Rows of a group.
     pub(super) rows: fn(&Group) -> Vec<TableRow>,
 }
 
@@ -29,13 +29,12 @@ impl Serialize for Table {
     }
 }
 
-/// Regions of a table that is about errors of masks and features; the built-in models make few on
-/// an easy scene.
+/// Regions of a table about errors of masks and features: found and with injected errors, as the
+/// built-in models make few on an easy scene.
 const WITH_ERRORS: fn(&Sources, &Available) -> Vec<Regions> = |own, _| vec![own.regions(), Regions::Flawed];
-/// Regions of a table that is about something else: perfect ones leave that as the only cause of a
-/// difference.
+/// Regions of a table about anything else: exact ones cannot be the cause of a difference.
 const PERFECT: fn(&Sources, &Available) -> Vec<Regions> = |_, _| vec![Regions::Exact];
-/// Regions of a table about what finds them.
+/// Regions of a table about masks and features themselves: found ones.
 const OWN: fn(&Sources, &Available) -> Vec<Regions> = |own, _| vec![own.regions()];
 
 /// Every table, in the order of `ablate all`.
@@ -105,8 +104,8 @@ pub static TABLES: [Table; 13] = [
         columns: &[("PSNR", 2), ("SIM", 3)],
         regions: PERFECT,
         rows: |group| {
-            // Longer than the other tables: geometry moves slowly at the rates of this stage, and
-            // it is geometry that the image loss protects.
+            // Longer than in the other tables: the image loss protects the geometry, which moves
+            // slowly at the learning rates of this stage.
             let long =
                 Setup { language_iterations: 3 * group.base.language_iterations, ..group.base.clone() };
             let without = Recipe { image_weight: 0.0, ..long.recipe };
@@ -155,7 +154,8 @@ pub static TABLES: [Table; 13] = [
         columns: &[("SIM", 3), ("codes", 0)],
         regions: WITH_ERRORS,
         rows: |group| {
-            // Step 3 finds again what matches have missed: without it they are all there is.
+            // Without step 3, which finds links that the matches have missed, the result depends on
+            // the matches alone.
             let recipe = Recipe { steps: [true, true, false], ..group.base.recipe };
             group.each::<MatchSources>(&group.available.matchers, |matcher| Setup {
                 matcher,
@@ -170,8 +170,8 @@ pub static TABLES: [Table; 13] = [
         columns: &[("PSNR", 2), ("splats", 0)],
         regions: PERFECT,
         rows: |group| {
-            // Short codes: those of 16 numbers for a million splats are more than lavapipe binds to
-            // a shader.
+            // Short codes: features of 16 numbers for a million splats exceed the largest buffer
+            // that lavapipe binds.
             let recipe = Recipe { feature_dim: 3, ..group.base.recipe };
             let row = |(label, most): (&str, usize)| {
                 group.row(label, Setup { max_points: Some(most), recipe, ..group.base.clone() })
@@ -185,14 +185,14 @@ pub static TABLES: [Table; 13] = [
         columns: &[("PSNR", 2), ("splats", 0)],
         regions: |_, _| vec![Regions::Flawed],
         rows: |group| {
-            let row = |views: usize| {
+            let views_row = |views: usize| {
                 let row = group.row(&format!("{views} views"), Setup { views, ..group.base.clone() });
                 if views <= group.available.views {
                     return row;
                 }
                 Group::impossible(row, format!("the data set has {} photos to spare", group.available.views))
             };
-            [2, 4, 6].map(row).into()
+            [2, 4, 6].map(views_row).into()
         },
     },
     Table {
@@ -236,7 +236,7 @@ pub static TABLES: [Table; 13] = [
     },
 ];
 
-/// The table of a name.
+/// Returns the table of a name.
 pub fn table(name: &str) -> Option<&'static Table> {
     TABLES.iter().find(|t| t.name == name)
 }
@@ -251,7 +251,7 @@ mod tests {
     }
 
     #[test]
-    fn rows_differ_in_what_their_table_is_about() {
+    fn tables_have_distinct_setups() {
         let sources = Sources::default();
         let base = Setup {
             views: 4,
@@ -285,7 +285,7 @@ mod tests {
                     assert!(!setups.contains(setup), "{}: two rows of one setup", table.name);
                     setups.push(setup.clone());
                 } else {
-                    assert!(!row.note.is_empty(), "{}: {} says not why", table.name, row.label);
+                    assert!(!row.note.is_empty(), "{}: {} has no note", table.name, row.label);
                 }
             }
             if ["masks", "features", "matcher", "initializer"].contains(&table.name) {

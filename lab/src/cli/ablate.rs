@@ -28,9 +28,9 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     let layout = one_layout(&sets)?;
     let paper = PaperSet::of(layout, sets.iter());
     let out = args.out.clone().unwrap_or_else(|| default_out(&sets));
-    // What a report says of an earlier run is its own to go on with.
+    // With --resume, a folder that holds a report is not in the way.
     check_place(&out, Kind::Folder, args.force || (args.resume && out.join(REPORT).is_file()))?;
-    // As long as it works, no other command writes there.
+    // Reserves the folder: no other command writes there meanwhile.
     let _reserved = Partial::inside(&out)?;
     check_place(&out.join(REPORT), Kind::File, true)?;
     let earlier = if args.resume { earlier(&out.join(REPORT))? } else { Vec::new() };
@@ -42,8 +42,8 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
             "layout": layout, "device": device.info().name, "plan": plan, "seconds": clock.elapsed().as_secs_f64(),
         })
     };
-    // Kept after every row: a long run that is stopped leaves what it has.
-    let mut keep = |done: Finished| {
+    // Written after every row, so that a stopped run keeps its finished rows.
+    let mut write_report = |done: Finished| {
         let report = Report { all: done.measurements, plan: &plan, paper: &paper, head: head() };
         report.write(&out)?;
         match done.table {
@@ -51,7 +51,7 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
             _ => Ok(()),
         }
     };
-    let all = ablate::run(&plan, sets, (&device, &registry), &earlier, progress.as_ref(), &mut keep);
+    let all = ablate::run(&plan, sets, (&device, &registry), &earlier, progress.as_ref(), &mut write_report);
     if let Err(Error::Cancelled | Error::DeviceLost { .. }) = all {
         let place = out.display();
         progress.inform(&format!(
@@ -68,7 +68,7 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
 /// Name of the report in the output folder.
 const REPORT: &str = "ablate.json";
 
-/// What a run has measured so far.
+/// Measurements of a run so far.
 struct Report<'a> {
     all: &'a [Measurement],
     plan: &'a Plan,
@@ -81,67 +81,76 @@ impl Report<'_> {
         FinishedTable::of(table, self.all, self.paper)
     }
 
-    fn begun(&self) -> impl Iterator<Item = FinishedTable> {
-        let begun = |table: &&'static Table| self.all.iter().any(|m| m.table == table.name);
-        self.plan.tables.iter().copied().filter(begun).map(|table| self.table(table))
+    /// Tables with at least one measurement.
+    fn started_tables(&self) -> impl Iterator<Item = FinishedTable> {
+        let has_rows = |table: &&'static Table| self.all.iter().any(|m| m.table == table.name);
+        self.plan.tables.iter().copied().filter(has_rows).map(|table| self.table(table))
     }
 
     fn json(&self) -> Value {
         let mut report = self.head.clone();
-        report["tables"] = self.begun().map(|table| table.json()).collect();
+        report["tables"] = self.started_tables().map(|table| table.json()).collect();
         report["measurements"] = json!(self.all);
         report
     }
 
     fn write(&self, out: &Path) -> Result<()> {
-        let text = |file: &Path, text: String| {
-            let write = |partial: &Path| std::fs::write(partial, text).map_err(Error::unwritable(file));
-            WrittenFile::open(file, true, &[])?.keep(write)
-        };
-        for table in self.begun() {
+        for table in self.started_tables() {
             let file = |extension: &str| out.join(format!("{}.{extension}", table.table.name));
-            text(&file("txt"), table.text())?;
-            text(&file("svg"), table.svg())?;
+            write_text(&file("txt"), table.text())?;
+            write_text(&file("svg"), table.svg())?;
         }
         WrittenFile::open(&out.join(REPORT), true, &[])?.keep(|file| write_json(file, &self.json()))
     }
 }
 
-/// The measurements of a report that an earlier run left; none where there is no report.
+fn write_text(file: &Path, text: String) -> Result<()> {
+    let write = |partial: &Path| std::fs::write(partial, text).map_err(Error::unwritable(file));
+    WrittenFile::open(file, true, &[])?.keep(write)
+}
+
+/// Measurements in the report of an earlier run; empty without a report.
 fn earlier(path: &Path) -> Result<Vec<Measurement>> {
     if !path.exists() {
         return Ok(Vec::new());
     }
-    let bad = |e: serde_json::Error| {
-        Error::input(format!("{}: not a report of ablate: {e}; leave out --resume", path.display()))
-    };
     let mut report: Value = files::read_json(path, "not a report of ablate, leave out --resume")?;
-    serde_json::from_value(report["measurements"].take()).map_err(bad)
+    serde_json::from_value(report["measurements"].take()).map_err(|e| {
+        Error::input(format!("{}: not a report of ablate: {e}; leave out --resume", path.display()))
+    })
 }
 
-/// Data sets under the names of their folders, with as many of the folders above as tell them
-/// apart.
+/// Opens data sets. Their names are the last components of their paths, as many as make all names
+/// distinct.
 fn data_sets(folders: &[PathBuf], layout: LayoutArg) -> Result<Vec<DataSet>> {
-    let whole = |f: &PathBuf| f.canonicalize().unwrap_or_else(|_| f.clone());
+    let absolute = |f: &PathBuf| f.canonicalize().unwrap_or_else(|_| f.clone());
     let parts: Vec<Vec<String>> = folders
         .iter()
-        .map(|f| whole(f).components().map(|c| c.as_os_str().to_string_lossy().into_owned()).collect())
+        .map(|f| absolute(f).components().map(|c| c.as_os_str().to_string_lossy().into_owned()).collect())
         .collect();
-    let last = |parts: &Vec<String>, n: usize| parts[parts.len().saturating_sub(n)..].join("/");
-    let distinct = |n: usize| {
-        let mut names: Vec<String> = parts.iter().map(|p| last(p, n)).collect();
-        names.sort();
-        names.windows(2).all(|w| w[0] != w[1])
-    };
     let longest = parts.iter().map(Vec::len).max().unwrap_or(1);
-    let Some(n) = (1..=longest).find(|n| distinct(*n)) else {
+    let Some(n) = (1..=longest).find(|n| are_distinct(&parts, *n)) else {
         return Err(Error::input("--data: the same folder twice; give each once"));
     };
-    let open = |(folder, parts): (&PathBuf, _)| DataSet::open(last(parts, n), folder, layout.given());
+    let open = |(folder, parts): (&PathBuf, &Vec<String>)| {
+        DataSet::open(last_components(parts, n), folder, layout.given())
+    };
     folders.iter().zip(&parts).map(open).collect()
 }
 
-/// Figures of different protocols have no mean.
+/// Whether the last `n` components of every path make a name of its own.
+fn are_distinct(parts: &[Vec<String>], n: usize) -> bool {
+    let mut names: Vec<String> = parts.iter().map(|p| last_components(p, n)).collect();
+    names.sort();
+    names.windows(2).all(|w| w[0] != w[1])
+}
+
+fn last_components(parts: &[String], n: usize) -> String {
+    parts[parts.len().saturating_sub(n)..].join("/")
+}
+
+/// Layout that all data sets have; an error where they differ, as figures of different protocols
+/// have no common mean.
 fn one_layout(sets: &[DataSet]) -> Result<Layout> {
     let first = sets.first().map_or(Layout::Own, |s| s.layout);
     match sets.iter().find(|s| s.layout != first) {
@@ -192,23 +201,24 @@ fn plan(args: &AblateArgs, registry: &Registry) -> Result<Plan> {
     })
 }
 
-/// The sources of every row; the built-in ones where nothing is said, so that tables of different
-/// machines compare.
+/// Sources of every row. Options that are not given default to the built-in sources, so that tables
+/// of different machines are comparable.
 fn sources(args: &AblateArgs, registry: &Registry) -> Result<Sources> {
     let (networks, own) = (inventory(registry), Sources::default());
-    fn of<K: SourceKind>(
-        text: &Option<String>,
-        own: SourceChoice,
-        networks: &Inventory,
-    ) -> Result<SourceChoice> {
-        text.as_deref().map_or(Ok(own), |text| choose::<K>(text, networks))
-    }
     Ok(Sources {
-        init: of::<GeometrySources>(&args.init, own.init, &networks)?,
-        matcher: of::<MatchSources>(&args.matcher, own.matcher, &networks)?,
-        masks: of::<MaskSources>(&args.masks, own.masks, &networks)?,
-        features: of::<FeatureSources>(&args.features, own.features, &networks)?,
+        init: choose_or::<GeometrySources>(&args.init, own.init, &networks)?,
+        matcher: choose_or::<MatchSources>(&args.matcher, own.matcher, &networks)?,
+        masks: choose_or::<MaskSources>(&args.masks, own.masks, &networks)?,
+        features: choose_or::<FeatureSources>(&args.features, own.features, &networks)?,
     })
+}
+
+fn choose_or<K: SourceKind>(
+    text: &Option<String>,
+    default: SourceChoice,
+    networks: &Inventory,
+) -> Result<SourceChoice> {
+    text.as_deref().map_or(Ok(default), |text| choose::<K>(text, networks))
 }
 
 fn regions(text: &str, own: &Sources) -> Result<Regions> {

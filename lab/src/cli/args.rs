@@ -1,10 +1,10 @@
 //! Command-line arguments.
 use crate::ablate::{Layout, TABLES};
 use crate::generate::{Flat, Spoil};
+use crate::protocol::ProtocolKind;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use splatvk::cli::args::{DeviceArgs, LogFormat, MACHINE, whole};
-use splatvk::eval::protocol::ProtocolKind;
 use splatvk::infer::provider;
 use std::path::PathBuf;
 
@@ -31,6 +31,57 @@ pub enum Command {
     Ablate(AblateArgs),
     /// Synthetic scene with ground truth, as hard as asked
     Generate(GenerateArgs),
+    /// Scene against the labels of LERF-OVS, 3D-OVS or ScanNet → figures of their protocols
+    Eval(EvalArgs),
+}
+
+/// Published protocols.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ProtocolArg {
+    /// LERF-OVS: a folder of frame_*.json, or ground_truth.json
+    Lerf,
+    /// 3D-OVS: a folder with segmentations/classes.txt, or ground_truth.json
+    #[value(name = "3dovs")]
+    Ovs,
+    /// ScanNet: a scene with label-filt/ and pose/; eight labels
+    Scannet,
+}
+
+impl ProtocolArg {
+    /// The protocol of the library.
+    pub fn kind(self) -> ProtocolKind {
+        match self {
+            ProtocolArg::Lerf => ProtocolKind::Lerf,
+            ProtocolArg::Ovs => ProtocolKind::Ovs,
+            ProtocolArg::Scannet => ProtocolKind::ScanNet,
+        }
+    }
+}
+
+/// `splatlab eval`
+#[derive(Debug, Args)]
+pub struct EvalArgs {
+    /// Scene directory
+    pub scene: PathBuf,
+    /// Folder of the labels, in the layout of the protocol
+    #[arg(long, value_name = "DIR")]
+    pub ground_truth: PathBuf,
+    /// What is read and how it is scored
+    #[arg(long, value_enum)]
+    pub protocol: ProtocolArg,
+    /// Cameras of the data set, to score labelled frames that the scene was not made from:
+    /// transforms.json, a COLMAP model folder, or cameras.json
+    #[arg(long, value_name = "FILE")]
+    pub cameras: Option<PathBuf>,
+    /// Write every rendered view and predicted mask here
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Write over what is there: ordinary files of the same names
+    #[arg(long)]
+    pub force: bool,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
 }
 
 fn tables() -> PossibleValuesParser {
@@ -40,21 +91,21 @@ fn tables() -> PossibleValuesParser {
 }
 
 fn spoils() -> impl TypedValueParser<Value = Spoil> {
-    ways(&Spoil::ALL)
+    one_of(&Spoil::ALL)
 }
 
 fn flats() -> impl TypedValueParser<Value = Flat> {
-    ways(&Flat::ALL)
+    one_of(&Flat::ALL)
 }
 
-/// One of a list of values, each with its name and what it does.
-fn ways<T: Copy + Send + Sync + 'static>(
+/// Parser of one of a list of (value, name, help text).
+fn one_of<T: Copy + Send + Sync + 'static>(
     all: &'static [(T, &'static str, &'static str)],
 ) -> impl TypedValueParser<Value = T> {
     let each = all.iter().map(|(_, name, about)| PossibleValue::new(*name).help(*about));
     PossibleValuesParser::new(each).try_map(|given| {
         let known = all.iter().find(|(_, name, _)| *name == given);
-        known.map(|(way, ..)| *way).ok_or("no such way")
+        known.map(|(value, ..)| *value).ok_or("no such way")
     })
 }
 
@@ -75,7 +126,7 @@ pub enum LayoutArg {
 }
 
 impl LayoutArg {
-    /// What was asked for; none = look.
+    /// Layout that the user chose; `None`: it is recognised from the folder.
     pub fn given(self) -> Option<Layout> {
         match self {
             LayoutArg::Auto => None,

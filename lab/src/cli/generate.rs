@@ -46,8 +46,8 @@ fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
     let size = args.size.split_once('x').and_then(|(w, h)| Some((w.parse().ok()?, h.parse().ok()?)));
     let size = size.ok_or_else(|| Error::input(format!("--size {}: write it as 640x480", args.size)))?;
     let effects = effects(args);
-    // The sensor's own noise stands in for the even one.
-    let usual = if effects.sensor_noise { 0.0 } else { SceneSpec::default().photo_noise };
+    // Sensor noise replaces the uniform noise by default.
+    let default_noise = if effects.sensor_noise { 0.0 } else { SceneSpec::default().photo_noise };
     Ok(SceneSpec {
         seed: args.seed,
         views: args.views,
@@ -61,7 +61,7 @@ fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
         occlusion: args.occlusion,
         similar: args.similar,
         pose_noise: args.pose_noise,
-        photo_noise: args.photo_noise.unwrap_or(usual),
+        photo_noise: args.photo_noise.unwrap_or(default_noise),
         steady: args.steady,
         zoom: args.zoom,
         flat: args.flat,
@@ -71,7 +71,7 @@ fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
     })
 }
 
-/// `--phone` turns everything on; the single flags say the rest.
+/// Effects of the options: `--phone` turns all on, the other flags add single ones.
 fn effects(args: &GenerateArgs) -> Effects {
     let phone = if args.phone { Effects::PHONE } else { Effects::default() };
     let swapped = args.spoil == Some(Spoil::SwappedExif);

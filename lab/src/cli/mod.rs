@@ -2,6 +2,7 @@
 //! of `splatvk`.
 mod ablate;
 pub mod args;
+mod eval;
 mod generate;
 
 use crate::Result;
@@ -31,6 +32,10 @@ impl Program for Lab {
                 ablate::ablate(&args)
             }
             Command::Generate(args) => generate::generate(&args),
+            Command::Eval(mut args) => {
+                args.device.provider = self.provider;
+                eval::eval(&args)
+            }
         }
     }
 }

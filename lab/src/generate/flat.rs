@@ -1,24 +1,24 @@
-//! Everything on one plane: sheets of colour on the ground seen straight down, as from a drone, or
-//! a poster seen from before it. The focal length of photos straight down is open: a longer one
-//! from higher up shows the same.
+//! Planar scenes: coloured sheets on the ground seen straight down, as from a drone, or a poster
+//! seen from the front. Photos straight down leave the focal length undetermined: a longer focal
+//! length from a greater height gives the same picture.
 use super::shapes::{SceneObject, Shape, paint};
 use glam::{DMat3, DVec3};
 use serde::Serialize;
 use splatvk::math::Random;
 use splatvk::scene::Pose;
 
-/// How photos of the plane z = 0 are taken.
+/// Arrangement of the cameras over the plane z = 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Flat {
-    /// Straight down, moved sideways.
+    /// Cameras look straight down and move sideways.
     Ground,
-    /// From around the normal, looking at the middle.
+    /// Cameras stand around the normal and look at the middle.
     Poster,
 }
 
 impl Flat {
-    /// Every way, its name and what it does.
+    /// All variants with their names and help texts.
     pub const ALL: [(Flat, &str, &str); 2] = [
         (Flat::Ground, "ground", "Seen straight down, as from a drone that moves sideways"),
         (Flat::Poster, "poster", "Seen from before it, from directions --baseline apart"),
@@ -27,17 +27,16 @@ impl Flat {
 
 /// Metres from the cameras to the plane.
 const DISTANCE: f64 = 0.95;
-/// Largest tilt of a photo straight down, degrees: what a gimbal leaves.
+/// Largest tilt of a photo straight down, degrees: residual error of a gimbal.
 const TILT: f64 = 1.0;
-/// Largest turn about the vertical, degrees: wind.
+/// Largest turn about the vertical, degrees, as by wind.
 const YAW: f64 = 5.0;
-/// Largest change of height, share.
+/// Largest relative change of height.
 const HEIGHT: f64 = 0.03;
-/// Half the thickness of a sheet, metres: a tenth of a pixel from the usual distance would be 0.15
-/// mm.
+/// Half the thickness of a sheet, metres; a tenth of a pixel at [`DISTANCE`] is 0.15 mm.
 const THIN: f64 = 5e-5;
 
-/// The ground and some sheets on it, at any angles.
+/// The ground with `sheets` sheets on it at random positions and angles.
 pub(super) fn objects(sheets: usize, texture: f64, random: &mut Random) -> Vec<SceneObject> {
     let ground = paint([0.36, 0.42, 0.3], 0.8 * texture, 0.08, random);
     let mut out = vec![SceneObject {
@@ -62,12 +61,12 @@ pub(super) fn objects(sheets: usize, texture: f64, random: &mut Random) -> Vec<S
     out
 }
 
-/// Where a camera of the plane stands, `angle` degrees from the middle of the set.
-pub(super) fn pose(way: Flat, angle: f64, random: &mut Random) -> Pose {
+/// Pose of a camera over the plane, `angle` degrees from the middle of the set.
+pub(super) fn pose(arrangement: Flat, angle: f64, random: &mut Random) -> Pose {
     let mut within = |reach: f64| reach * (2.0 * random.uniform() - 1.0);
-    // Looking down the normal, the picture's y against the plane's.
+    // View along −z; the picture's y axis is the plane's −y axis.
     let down = DMat3::from_cols(DVec3::X, DVec3::NEG_Y, DVec3::NEG_Z);
-    let (rotation, centre) = match way {
+    let (rotation, centre) = match arrangement {
         Flat::Ground => {
             let tilt = DMat3::from_rotation_x(within(TILT).to_radians())
                 * DMat3::from_rotation_y(within(TILT).to_radians())
@@ -92,12 +91,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn flat_scenes_lie_on_one_plane() {
-        for (way, straight) in [(Flat::Ground, true), (Flat::Poster, false)] {
+    fn flat_scene_lies_on_one_plane() {
+        for (arrangement, straight) in [(Flat::Ground, true), (Flat::Poster, false)] {
             let spec = SceneSpec {
                 seed: 1000,
                 size: (160, 120),
-                flat: Some(way),
+                flat: Some(arrangement),
                 held_out: 1,
                 ..SceneSpec::default()
             };
@@ -106,8 +105,8 @@ mod tests {
                 let seen = render(&scene, camera, 0.0, 0);
                 for p in (0..160 * 120).step_by(97) {
                     let pixel = glam::DVec2::new((p % 160) as f64 + 0.5, (p / 160) as f64 + 0.5);
-                    let at = camera.unproject(pixel, f64::from(seen.depth.data[p]));
-                    assert!(at.z.abs() < 0.002, "{way:?} {at}");
+                    let point = camera.unproject(pixel, f64::from(seen.depth.data[p]));
+                    assert!(point.z.abs() < 0.002, "{arrangement:?} {point}");
                 }
                 let lean = camera.pose.rotation.row(2).angle_between(DVec3::NEG_Z).to_degrees();
                 assert!(!straight || lean < 2.0, "{lean}");

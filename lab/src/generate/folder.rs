@@ -16,24 +16,23 @@ use splatvk::scene::Camera;
 use splatvk_types::files;
 use std::path::Path;
 
-/// Folders of regions without and with flaws.
+/// Folders of regions without and with injected errors.
 const REGIONS: [&str; 2] = ["regions_exact", "regions_flawed"];
 
-/// The ground truth.
+/// File of the ground truth.
 const TRUTH: &str = "ground_truth.json";
 
-/// The embeddings of texts in a folder of regions.
+/// File of text embeddings in a folder of regions.
 const TEXTS: &str = "text_embeddings.npz";
 
-/// JPEG quality of held-out views, and of photos unless asked otherwise: no visible artefacts.
+/// JPEG quality of held-out views, and by default of photos: no visible artefacts.
 const QUALITY: u8 = 95;
 
-/// What is in a folder that [`generate`] or [`write_regions`] made and neither of them wrote,
-/// relative to it; `None` where the folder is no such one.
+/// Entries that [`generate`] and [`write_regions`] do not write, as paths relative to `folder`;
+/// `None` where neither of them made the folder.
 pub fn foreign(folder: &Path) -> Option<Vec<String>> {
     let truth: Option<serde_json::Value> = files::read_json(&folder.join(TRUTH), "").ok();
-    // Data sets of other makes may lie in the same layout; only ours state the knobs they were made
-    // with.
+    // Other data sets may have the same layout; only generated ones have the key "knobs".
     let knobs = truth.as_ref().is_some_and(|truth| !truth["knobs"].is_null());
     let regions = |name: &str| folder.join(name).join(TEXTS).is_file();
     if !REGIONS.into_iter().all(regions) || truth.is_some() && !knobs {
@@ -44,8 +43,8 @@ pub fn foreign(folder: &Path) -> Option<Vec<String>> {
     Some(files::foreign(folder, &|name, is_folder| is_own(name, is_folder, views.as_deref())))
 }
 
-/// Whether a name is that of a file or folder of generated data with these views; `None` for
-/// regions alone, whose views are those of other data.
+/// Whether a path belongs to generated data with these views; `None`: to regions alone, which may
+/// have any views.
 fn is_own(name: &str, is_folder: bool, views: Option<&[&str]>) -> bool {
     let Some((folder, file)) = name.rsplit_once('/') else {
         let folders: &[&str] = if views.is_some() { &["images", "held_out", "depth", "masks"] } else { &[] };
@@ -67,7 +66,7 @@ fn is_own(name: &str, is_folder: bool, views: Option<&[&str]>) -> bool {
 }
 
 /// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without
-/// and with flaws.
+/// and with injected errors.
 pub fn generate(
     folder: &Path,
     spec: &SceneSpec,
@@ -92,7 +91,7 @@ pub fn generate(
     write_regions(folder, folder, flaws)
 }
 
-/// Renders and writes every view; the frames of the ground truth.
+/// Renders and writes every view; returns the frames of the ground truth.
 fn write_views(
     folder: &Path,
     scene: &SyntheticScene,
@@ -100,7 +99,7 @@ fn write_views(
     progress: &dyn Progress,
 ) -> Result<Vec<serde_json::Value>> {
     let quality = spec.effects.jpeg.unwrap_or(QUALITY);
-    // Held-out views show what is there, not what a phone would make of it.
+    // Where photos have effects of a phone camera, held-out views are free of noise.
     let held_out_noise = if spec.effects.any() { 0.0 } else { spec.photo_noise };
     progress.begin("render", (scene.photo_effects.len() + scene.test.len()) as u64);
     let shown = Photos::new(scene, spec)?;
@@ -165,10 +164,10 @@ fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &RayCast, jpeg
 
 fn frame_json(c: &Camera, split: Split, file: &str) -> serde_json::Value {
     let (r, t) = (c.pose.rotation, c.pose.translation);
-    let row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]];
+    let matrix_row = |k: usize| [r.x_axis[k], r.y_axis[k], r.z_axis[k], t[k]];
     json!({
         "split": split, "file": file, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy,
-        "world_to_camera": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+        "world_to_camera": [matrix_row(0), matrix_row(1), matrix_row(2), [0.0, 0.0, 0.0, 1.0]],
     })
 }
 
@@ -181,7 +180,7 @@ mod tests {
     use splatvk::scene::Lens;
 
     #[test]
-    fn a_generated_folder_reads_back_as_ground_truth() {
+    fn generate_reads_back_as_ground_truth() {
         let dir = tempfile::tempdir().unwrap();
         let spec = SceneSpec { seed: 1000, size: (160, 120), views: 3, held_out: 2, ..SceneSpec::default() };
         generate(dir.path(), &spec, &InjectedErrors::default_rates(1000), &Silent).unwrap();
@@ -207,7 +206,7 @@ mod tests {
             let _ = std::fs::rename(&path, dir.path().join("aside"));
             std::fs::write(&path, "precious").unwrap();
             let found = foreign(dir.path()).unwrap();
-            assert!(found.iter().any(|f| f == name), "somebody's own file is in it: {found:?}");
+            assert!(found.iter().any(|f| f == name), "{name} is not in {found:?}");
             std::fs::remove_file(&path).unwrap();
             let _ = std::fs::rename(dir.path().join("aside"), &path);
         }
@@ -221,8 +220,8 @@ mod tests {
     }
 
     #[test]
-    fn photos_have_the_jpeg_quality_that_is_asked_for_and_held_out_views_keep_theirs() {
-        let bytes = |jpeg: Option<u8>| {
+    fn jpeg_quality_applies_to_photos_only() {
+        let file_sizes = |jpeg: Option<u8>| {
             let dir = tempfile::tempdir().unwrap();
             let effects = Effects { jpeg, ..Effects::default() };
             let spec = SceneSpec {
@@ -238,23 +237,23 @@ mod tests {
             ["images/train_00.jpg", "held_out/test_02.jpg"]
                 .map(|f| dir.path().join(f).metadata().unwrap().len())
         };
-        let (usual, coarse) = (bytes(None), bytes(Some(5)));
-        assert!(2 * coarse[0] < usual[0] && coarse[1] == usual[1], "{usual:?} {coarse:?}");
+        let (default, coarse) = (file_sizes(None), file_sizes(Some(5)));
+        assert!(2 * coarse[0] < default[0] && coarse[1] == default[1], "{default:?} {coarse:?}");
     }
 
-    /// Value of a picture between pixels, bilinear.
-    fn between(image: &splatvk::scene::RgbImage, at: DVec2) -> Option<[f32; 3]> {
+    /// Bilinear sample of an image; `None` outside the pixel centres.
+    fn bilinear(image: &splatvk::scene::RgbImage, at: DVec2) -> Option<[f32; 3]> {
         let (x, y) = (at.x - 0.5, at.y - 0.5);
         let inside = x >= 0.0 && y >= 0.0 && x + 1.0 < image.width as f64 && y + 1.0 < image.height as f64;
         inside.then(|| {
             let (i, j, fx, fy) = (x as usize, y as usize, x.fract() as f32, y.fract() as f32);
-            let row = |j: usize, c: usize| image.at(i, j)[c] * (1.0 - fx) + image.at(i + 1, j)[c] * fx;
-            [0, 1, 2].map(|c| row(j, c) * (1.0 - fy) + row(j + 1, c) * fy)
+            let along_x = |j: usize, c: usize| image.at(i, j)[c] * (1.0 - fx) + image.at(i + 1, j)[c] * fx;
+            [0, 1, 2].map(|c| along_x(j, c) * (1.0 - fy) + along_x(j + 1, c) * fy)
         })
     }
 
     #[test]
-    fn photos_undone_by_the_lens_in_the_file_are_the_stated_pinhole() {
+    fn stated_lens_undistorts_photos() {
         let dir = tempfile::tempdir().unwrap();
         let effects = Effects { focal: true, lens: true, centre: true, ..Effects::default() };
         let spec = SceneSpec {
@@ -273,20 +272,20 @@ mod tests {
         let stated = frame.lens.unwrap();
         let photo = truth.image(frame).unwrap();
         let pinhole = render::render(&made, &frame.camera, 0.0, 0).image;
-        // mean square difference to the pinhole, with and without the lens
+        // Mean square difference to the pinhole image after undistortion with a lens.
         let error = |lens: Lens| {
             let (mut sum, mut count) = (0.0, 0);
             for p in 0..320 * 240 {
                 let pixel = DVec2::new((p % 320) as f64 + 0.5, (p / 320) as f64 + 0.5);
                 let point = frame.camera.unproject(pixel, 1.0);
-                let Some(shown) = between(&photo, lens.project(&frame.camera, point)) else { continue };
+                let Some(shown) = bilinear(&photo, lens.project(&frame.camera, point)) else { continue };
                 sum += (0..3).map(|c| f64::from(shown[c] - pinhole.data[p][c]).powi(2)).sum::<f64>();
                 count += 1;
             }
             sum / f64::from(count)
         };
-        let (undone, ignored) = (error(stated), error(Lens::NONE));
-        assert!(undone < 0.25 * ignored, "{undone} {ignored}");
+        let (undistorted, ignored) = (error(stated), error(Lens::NONE));
+        assert!(undistorted < 0.25 * ignored, "{undistorted} {ignored}");
         assert!(truth.frames[2].lens.is_none() && stated.k1.abs() > 0.02, "{stated:?}");
     }
 }

@@ -1,31 +1,29 @@
-//! Out of doors: houses behind the objects, paved ground from the feet of the photographer to the
-//! horizon, clouds and no end.
+//! Outdoor scenes: a house behind the objects, paved ground from the photographer's feet to the
+//! horizon, and a cloudy sky at infinite distance.
 use super::shapes::{Paint, SceneObject, Shape, paint};
 use glam::DVec3;
 use splatvk::math::Random;
 
-/// Lengths of a scene out of doors over those of a table: crates of one to two metres, seen from
-/// ten.
+/// Scale of an outdoor scene over a table scene: crates of one to two metres, seen from ten.
 pub(super) const SCALE: f64 = 10.0;
-/// Height of the camera's elevation above the horizontal, degrees: eyes at two metres. The ground
-/// is at the feet.
+/// Elevation of the camera above the horizontal, degrees: eyes at two metres.
 pub(super) const ELEVATION: f64 = 5.0;
 
-/// What stands behind everything, infinitely far away.
+/// Sky at infinite distance behind all objects.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sky {
     /// Index in the masks.
     pub label: u32,
-    /// Clouds, by direction.
+    /// Pattern of the clouds over the unit direction.
     clouds: Paint,
 }
 
 impl Sky {
-    /// What it is called.
+    /// Phrase of its label.
     pub const PHRASE: &str = "cloudy sky";
 
     pub(super) fn new(random: &mut Random) -> Sky {
-        // Clouds of 15° and less, too faint for most detectors of corners.
+        // Clouds of 15° and less, too faint for most corner detectors.
         Sky {
             label: 3,
             clouds: Paint { colour: [1.0; 3], contrast: 0.08, grain: 0.26, seed: random.bits(), tile: None },
@@ -42,7 +40,7 @@ impl Sky {
     }
 }
 
-/// Ground and houses with patterns of contrast `texture`; the sky has label 3.
+/// Makes ground and house with patterns of contrast `texture`, labels 1 and 2; the sky has label 3.
 pub(super) fn background(texture: f64, random: &mut Random) -> Vec<SceneObject> {
     let surface = |label, phrase: String, shape, colour, grain, random: &mut Random| SceneObject {
         label,
@@ -52,7 +50,7 @@ pub(super) fn background(texture: f64, random: &mut Random) -> Vec<SceneObject> 
     };
     let ground = Shape::Plane(DVec3::Z, 0.0);
     let mut objects = vec![surface(1, "paved ground".into(), ground, [0.45, 0.43, 0.4], 0.05, random)];
-    // One long building behind, as wide as most photos: its front is what the sky ends at.
+    // One long building as wide as most photos; the sky ends at its front.
     let tall = 0.35 + 0.25 * random.uniform();
     let front = Shape::Block(
         DVec3::new(0.5 * (random.uniform() - 0.5), 1.3, 0.5 * tall) * SCALE,

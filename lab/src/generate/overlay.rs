@@ -11,32 +11,34 @@ const BLACK: [f32; 3] = [0.06; 3];
 const RED: [f32; 3] = [0.65, 0.05, 0.1];
 
 impl Spoil {
-    /// Draws over a photo what this way has at the same place in every photo; others draw nothing.
+    /// Draws the overlay of this variant over a photo, at the same place in every photo; variants
+    /// without an overlay draw nothing.
     pub fn draw_over(self, image: &mut RgbImage) {
         let (w, h) = (image.width, image.height);
         image.data.par_iter_mut().enumerate().for_each(|(i, colour)| {
-            let at = [(i % w) as f64 + 0.5, (i / w) as f64 + 0.5].map(|v| v / h as f64);
-            if let Some((ink, alpha)) = ink(self, at, w as f64 / h as f64) {
+            let position = [(i % w) as f64 + 0.5, (i / w) as f64 + 0.5].map(|v| v / h as f64);
+            if let Some((ink, alpha)) = ink(self, position, w as f64 / h as f64) {
                 *colour = std::array::from_fn(|c| alpha * ink[c] + (1.0 - alpha) * colour[c]);
             }
         });
     }
 }
 
-/// Colour and opacity at a place in units of the height; the frame is `width` wide.
+/// Colour and opacity of the overlay at a position, in units of the frame's height; the frame is
+/// `width` wide.
 fn ink(spoil: Spoil, [x, y]: [f64; 2], width: f64) -> Option<([f32; 3], f32)> {
     let opaque = |colour| Some((colour, 1.0));
-    // A line of letters from `left` on, `top` to `top + height`, on a ground.
+    // A line of letters on a plain ground: it starts at `left` and is `height` high.
     let sign = |[left, top]: [f64; 2], height: f64, letters: f64, ink, ground| {
-        opaque(if written([(x - left) / height, (y - top) / height], letters) { ink } else { ground })
+        opaque(if is_stroke([(x - left) / height, (y - top) / height], letters) { ink } else { ground })
     };
     match spoil {
         Spoil::Watermark => {
             let (s, c) = 20f64.to_radians().sin_cos();
             let (along, down) = (c * x + s * y + 2.0, c * y - s * x + 2.0);
             let row = (down / 0.22).floor();
-            let on = [(along + 0.37 * row).rem_euclid(0.6) / 0.09, (down - 0.22 * row) / 0.09];
-            written(on, 6.0).then_some((WHITE, 0.4))
+            let in_line = [(along + 0.37 * row).rem_euclid(0.6) / 0.09, (down - 0.22 * row) / 0.09];
+            is_stroke(in_line, 6.0).then_some((WHITE, 0.4))
         }
         Spoil::Caption if y < 0.11 => sign([0.02, 0.02], 0.07, 18.0, WHITE, BLACK),
         Spoil::Caption if y > 0.9 => sign([0.02, 0.92], 0.06, 20.0, RED, WHITE),
@@ -56,9 +58,9 @@ fn ink(spoil: Spoil, [x, y]: [f64; 2], width: f64) -> Option<([f32; 3], f32)> {
     }
 }
 
-/// Whether a stroke of made-up letters is at a place in units of their height, the first letter's
-/// corner at the origin.
-fn written([u, v]: [f64; 2], letters: f64) -> bool {
+/// Whether a position lies on a stroke of made-up letters. It is in units of their height, from the
+/// upper left corner of the first letter.
+fn is_stroke([u, v]: [f64; 2], letters: f64) -> bool {
     let (rows, columns) = LETTER;
     let size = columns as f64 + 1.0;
     let column = u * rows as f64;
@@ -82,7 +84,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn overlays_cover_the_same_pixels_everywhere() {
+    fn draw_over_covers_same_pixels() {
         let drawn = |spoil: Spoil, v: f32| {
             let mut image = RgbImage { width: 160, height: 120, data: vec![[v; 3]; 160 * 120] };
             spoil.draw_over(&mut image);

@@ -10,19 +10,19 @@ use splatvk::scene::{Camera, Lens, RgbImage};
 /// Focal length over width: from an ultra-wide crop (71° across) to a 28 mm equivalent cropped to
 /// 4:3 (45°).
 const FOCAL: (f64, f64) = (0.7, 1.2);
-/// Largest |k1|: three times what the phone of the set `breakfast-phone` has, so that both signs
-/// are well covered.
+/// Largest |k1|: three times that of the phone of the set `breakfast-phone`, so that both signs are
+/// well covered.
 const K1: f64 = 0.15;
 /// Largest |k2 / k1|: as the lens of `breakfast-phone`, whose terms are 0.06 and −0.02.
 const K2_SHARE: f64 = 1.0 / 3.0;
-/// Least slope of the distorted by the undistorted radius anywhere in the picture: below it the
-/// corners are squeezed to a quarter and no lens of a phone looks like that.
+/// Smallest derivative of the distorted radius by the undistorted one in the picture. A smaller one
+/// squeezes the corners below a quarter, unlike the lens of any phone.
 const MIN_SLOPE: f64 = 0.25;
 /// Largest offset of the principal point along x and along y, share of the width.
 const CENTRE: f64 = 0.01;
-/// Largest change of exposure between a photo and the scene's own light, stops.
+/// Largest change of exposure of a photo, stops.
 const EXPOSURE: f64 = 0.35;
-/// Largest gain of one channel over the others.
+/// Largest relative change of one channel by white balance.
 const WHITE_BALANCE: f64 = 0.06;
 /// Largest share of light lost in the corners.
 const VIGNETTING: f64 = 0.35;
@@ -31,7 +31,7 @@ const FULL_WELL: f64 = 3000.0;
 /// Read noise, electrons.
 const READ_NOISE: f64 = 4.0;
 
-/// Which effects the photos of a scene have; everything they need is drawn from the scene's seed.
+/// Camera effects that the photos of a scene have; their parameters are drawn from its seed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Effects {
     /// Focal length drawn instead of 1.025 widths.
@@ -46,12 +46,12 @@ pub struct Effects {
     pub sensor_noise: bool,
     /// JPEG quality of the photos, instead of 95.
     pub jpeg: Option<u8>,
-    /// Every other photo by a second camera, with optics and vignetting of its own.
+    /// Every other photo by a second camera, with intrinsics and vignetting of its own.
     pub two_cameras: bool,
 }
 
 impl Effects {
-    /// As a phone takes photos.
+    /// All effects of a phone camera.
     pub const PHONE: Effects = Effects {
         focal: true,
         lens: true,
@@ -62,14 +62,15 @@ impl Effects {
         two_cameras: false,
     };
 
-    /// Whether there is any.
+    /// Whether any effect is on.
     pub fn any(&self) -> bool {
         *self != Effects::default()
     }
 }
 
-/// The slope stays well above 0 out to every corner, so that each pixel has one ray.
-fn fits(lens: &Lens, camera: &Camera) -> bool {
+/// Whether the slope of the distortion stays above [`MIN_SLOPE`] out to every corner, so that each
+/// pixel has one ray.
+fn is_invertible(lens: &Lens, camera: &Camera) -> bool {
     let (w, h) = (f64::from(camera.width), f64::from(camera.height));
     let corners = [(0.0, 0.0), (w, 0.0), (0.0, h), (w, h)];
     let reach = corners.map(|(x, y)| camera.ray(DVec2::new(x, y)).truncate().length());
@@ -85,12 +86,12 @@ fn fits(lens: &Lens, camera: &Camera) -> bool {
     true
 }
 
-/// How one photo was lit.
+/// True photometric parameters of one photo.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct TrueLight {
-    /// Stops; the linear values are multiplied by 2 to this power.
+    /// Exposure in stops: linear values are multiplied by 2 to this power.
     pub exposure_ev: f64,
-    /// Gain of R, G and B beside the exposure.
+    /// Gain of R, G and B on top of the exposure.
     pub white_balance: [f64; 3],
     /// v2, v4 of the fall-off `1 + v2 ρ² + v4 ρ⁴`; ρ is the distance from the principal point over
     /// half the diagonal.
@@ -98,7 +99,7 @@ pub struct TrueLight {
 }
 
 impl TrueLight {
-    /// Factor of the linear value per channel at a pixel position.
+    /// Gain of the linear value per channel at a pixel position.
     pub fn gain(&self, camera: &Camera, pixel: DVec2) -> [f64; 3] {
         let half = DVec2::new(f64::from(camera.width), f64::from(camera.height)).length() / 2.0;
         let s = (pixel - DVec2::new(camera.cx, camera.cy)).length_squared() / (half * half);
@@ -107,74 +108,75 @@ impl TrueLight {
     }
 }
 
-/// Effects on one photo, in this order: lens, light, noise, 8 bits and JPEG.
+/// Effects on one photo. Their order is lens, light, noise, 8 bits and JPEG.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PhotoEffects {
     /// The undistorted pinhole.
     pub camera: Camera,
-    /// Its lens.
+    /// Distortion.
     pub lens: Option<Lens>,
-    /// Its light.
+    /// Exposure, white balance and vignetting.
     pub light: Option<TrueLight>,
-    /// Seed of its noise.
+    /// Seed of the sensor noise.
     pub noise: Option<u64>,
 }
 
-/// Optics that the photos of one camera share.
-struct Optics {
-    /// Share of the width.
+/// Intrinsics and vignetting that the photos of one camera share.
+struct Intrinsics {
+    /// Focal length, share of the width.
     focal: f64,
-    /// Principal point from the middle, shares of the width.
+    /// Offset of the principal point from the middle, shares of the width.
     offset: DVec2,
     lens: Option<Lens>,
     /// v2, v4 of [`TrueLight::vignetting`].
     vignetting: [f64; 2],
 }
 
-/// Draws a camera; `widest` is one of the pinholes that it is to replace.
-fn optics(widest: &Camera, effects: &Effects, seed: u64) -> Result<Optics> {
-    let (mut optics, mut light) = (Random::new(seed ^ 0x1e45), Random::new(seed ^ 0x71e));
-    let focal = between(&mut optics, FOCAL.0, FOCAL.1);
-    let offset = DVec2::new(between(&mut optics, -CENTRE, CENTRE), between(&mut optics, -CENTRE, CENTRE));
+/// Draws the intrinsics of a camera; `example` is one of the pinholes that it replaces.
+fn draw_intrinsics(example: &Camera, effects: &Effects, seed: u64) -> Result<Intrinsics> {
+    let (mut geometric, mut light) = (Random::new(seed ^ 0x1e45), Random::new(seed ^ 0x71e));
+    let focal = between(&mut geometric, FOCAL.0, FOCAL.1);
+    let offset =
+        DVec2::new(between(&mut geometric, -CENTRE, CENTRE), between(&mut geometric, -CENTRE, CENTRE));
     let mut lens = None;
     if effects.lens {
-        let camera = refocused(widest, focal, offset, effects);
+        let camera = with_intrinsics(example, focal, offset, effects);
         let drawn = (0..1000).find_map(|_| {
-            let k1 = between(&mut optics, -K1, K1);
-            let lens = Lens::radial(k1, k1 * between(&mut optics, -K2_SHARE, K2_SHARE));
-            fits(&lens, &camera).then_some(lens)
+            let k1 = between(&mut geometric, -K1, K1);
+            let lens = Lens::radial(k1, k1 * between(&mut geometric, -K2_SHARE, K2_SHARE));
+            is_invertible(&lens, &camera).then_some(lens)
         });
         lens = Some(drawn.ok_or_else(|| Error::work("generate: no lens covers the picture"))?);
     }
-    // The share that is lost in the corner, and how late the fall-off sets in: 0 = with ρ², 1 =
-    // with ρ⁴.
+    // Share of light lost in the corners, and share of the fall-off that goes with ρ⁴, not ρ².
     let (lost, late) = (between(&mut light, 0.0, VIGNETTING), light.uniform());
-    Ok(Optics { focal, offset, lens, vignetting: [-lost * (1.0 - late), -lost * late] })
+    Ok(Intrinsics { focal, offset, lens, vignetting: [-lost * (1.0 - late), -lost * late] })
 }
 
+/// Draws uniformly from [a, b].
 fn between(random: &mut Random, a: f64, b: f64) -> f64 {
     a + (b - a) * random.uniform()
 }
 
-/// Draws what the photos of one scene go through. Effects that are off change nothing that is drawn
-/// for the others.
+/// Draws the effects on the photos of one scene. Switching an effect off leaves the parameters of
+/// the others unchanged.
 pub fn photo_effects(cameras: &[Camera], effects: &Effects, seed: u64) -> Result<Vec<PhotoEffects>> {
     let Some(first) = cameras.first() else { return Ok(Vec::new()) };
     let stream = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
-    let mut taken_with = vec![optics(first, effects, stream)?];
+    let mut intrinsics = vec![draw_intrinsics(first, effects, stream)?];
     if effects.two_cameras {
-        taken_with.push(optics(first, effects, stream ^ 0x2cab_0000)?);
+        intrinsics.push(draw_intrinsics(first, effects, stream ^ 0x2cab_0000)?);
     }
     let mut light = Random::new(stream ^ 0x116f7);
     let photo_effects = cameras.iter().enumerate().map(|(i, camera)| {
-        let own = &taken_with[i % taken_with.len()];
+        let own = &intrinsics[i % intrinsics.len()];
         let drawn = TrueLight {
             exposure_ev: between(&mut light, -EXPOSURE, EXPOSURE),
             white_balance: [(); 3].map(|()| 1.0 + between(&mut light, -WHITE_BALANCE, WHITE_BALANCE)),
             vignetting: own.vignetting,
         };
         PhotoEffects {
-            camera: refocused(camera, own.focal, own.offset, effects),
+            camera: with_intrinsics(camera, own.focal, own.offset, effects),
             lens: own.lens,
             light: effects.light.then_some(drawn),
             noise: effects.sensor_noise.then_some(seed.wrapping_mul(0x100_0000_01b3) ^ (i as u64) << 48),
@@ -183,8 +185,8 @@ pub fn photo_effects(cameras: &[Camera], effects: &Effects, seed: u64) -> Result
     Ok(photo_effects.collect())
 }
 
-/// The camera with the focal length and the principal point of the effects.
-fn refocused(camera: &Camera, focal: f64, offset: DVec2, effects: &Effects) -> Camera {
+/// Returns the camera with the drawn focal length and principal point, where these effects are on.
+fn with_intrinsics(camera: &Camera, focal: f64, offset: DVec2, effects: &Effects) -> Camera {
     let (mut camera, width) = (camera.clone(), f64::from(camera.width));
     if effects.focal {
         camera.fx = focal * width;
@@ -198,7 +200,7 @@ fn refocused(camera: &Camera, focal: f64, offset: DVec2, effects: &Effects) -> C
 }
 
 impl PhotoEffects {
-    /// Puts light and noise on a rendered picture (sRGB values).
+    /// Applies light and noise to a rendered picture (sRGB values).
     pub fn expose(&self, image: &mut RgbImage) {
         if self.light.is_none() && self.noise.is_none() {
             return;
@@ -244,8 +246,8 @@ mod tests {
         SceneSpec { seed, size: (320, 240), photo_noise: 0.0, effects, ..SceneSpec::default() }
     }
 
-    /// Small white discs before nothing, and for each its centre and its rim. They lie flat, so
-    /// that each has one brightness; rows above would see them from the side.
+    /// Small white discs on a black background, with the centre and rim of each. They lie flat, so
+    /// that each has one brightness; higher rows of the picture would show them from the side.
     fn markers(camera: &Camera, lens: &Lens) -> (SyntheticScene, Vec<(DVec3, Vec<DVec3>)>) {
         let to_world = camera.pose.inverse();
         let (mut objects, mut places) = (Vec::new(), Vec::new());
@@ -277,7 +279,7 @@ mod tests {
         )
     }
 
-    /// Centre of mass of a polygon.
+    /// Centroid of a polygon.
     fn centroid(corners: &[DVec2]) -> DVec2 {
         let (mut sum, mut area) = (DVec2::ZERO, 0.0);
         for (k, a) in corners.iter().enumerate() {
@@ -290,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn known_points_show_where_the_stated_lens_puts_them() {
+    fn photo_shows_markers_at_projection() {
         let mut largest_shift: f64 = 0.0;
         for seed in 1000..1008 {
             let effects = Effects { focal: true, lens: true, centre: true, ..Effects::default() };
@@ -314,12 +316,12 @@ mod tests {
                 largest_shift = largest_shift.max((camera.project(centre).0 - stated).length());
             }
         }
-        // What is tested is not the pinhole: without the lens points lie many pixels elsewhere.
+        // The test is sensitive to the lens: the pinhole's projections lie many pixels away.
         assert!(largest_shift > 5.0, "{largest_shift}");
     }
 
     #[test]
-    fn every_drawn_lens_has_one_ray_per_pixel() {
+    fn drawn_lenses_are_invertible() {
         let cameras = build_scene(&spec(1000, Effects::default())).unwrap().train;
         let (mut barrel, mut pincushion) = (0, 0);
         for seed in 1000..1200 {
@@ -344,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn means_follow_the_stated_gains() {
+    fn photo_means_follow_stated_gains() {
         let dark = spec(1000, Effects::default());
         let plain = build_scene(&dark).unwrap();
         let before: Vec<RgbImage> =
@@ -355,7 +357,7 @@ mod tests {
         for (photo_effects, before) in lit.photo_effects.iter().zip(&before) {
             let image = photo(&lit, photo_effects, 0.0, 0).image;
             let light = photo_effects.light.unwrap();
-            // a block of the middle and one of a corner, where the fall-off counts
+            // A block in the middle, and one in a corner with strong fall-off.
             for (x0, y0) in [(140, 100), (0, 0)] {
                 let (mut sum, mut stated) = ([0.0; 3], [0.0; 3]);
                 for p in (y0..y0 + 40).flat_map(|y| (x0..x0 + 40).map(move |x| y * 320 + x)) {
@@ -366,18 +368,18 @@ mod tests {
                         stated[c] += (to_linear(f64::from(before.data[p][c])) * gain[c]).min(1.0);
                     }
                 }
-                // 1600 pixels of at most 10 % noise each leave a quarter of a percent
+                // The mean of 1600 pixels with at most 10 % noise each has 0.25 % noise.
                 assert!((0..3).all(|c| (sum[c] / stated[c] - 1.0).abs() < 0.01), "{sum:?} {stated:?}");
             }
             first.push(light.exposure_ev);
         }
-        // The first photo is lit like any other, and all differ.
+        // The exposure of the first photo is drawn like all others, and all differ.
         assert!(first.iter().all(|e| e.abs() > 1e-3 && e.abs() <= EXPOSURE), "{first:?}");
         assert!(first.windows(2).all(|w| (w[0] - w[1]).abs() > 1e-3));
     }
 
     #[test]
-    fn sensor_noise_has_the_stated_spread() {
+    fn sensor_noise_has_stated_sigma() {
         let camera = build_scene(&spec(1000, Effects::default())).unwrap().train[0].clone();
         let photo_effects = PhotoEffects { camera, lens: None, light: None, noise: Some(5) };
         let grey = to_srgb(0.18) as f32;
@@ -391,7 +393,7 @@ mod tests {
     }
 
     #[test]
-    fn effects_that_are_off_change_nothing_else() {
+    fn effects_are_drawn_independently() {
         let plain = build_scene(&spec(1000, Effects::default())).unwrap();
         let phone = build_scene(&spec(1000, Effects::PHONE)).unwrap();
         assert!(

@@ -1,4 +1,4 @@
-//! The photos of a scene, spoilt or not.
+//! Photos of a synthetic scene, with or without a fault of the set.
 use super::render::{self, RayCast};
 use super::scene::{SceneSpec, SyntheticScene, build_scene};
 use super::shapes::Shape;
@@ -7,29 +7,29 @@ use crate::{Error, Result};
 use glam::{DMat3, DVec3};
 use splatvk::scene::Pose;
 
-/// The photo that is spoilt where one alone is: neither the first nor the last.
+/// Index of the spoilt photo where the fault concerns one photo: neither the first nor the last.
 const SPOILT_PHOTO: usize = 1;
 
-/// Seed of the other scene: outside every range of seeds in docs/internals/data.md.
+/// Offset of the other scene's seed, out of every range of seeds in docs/internals/data.md.
 const OTHER_SCENE: u64 = 5000;
-/// Side of the tile that repeats, in units of the scene: about a tenth of the picture.
+/// Side of the repeated tile, in units of the scene: about a tenth of the picture.
 const TILE: f64 = 0.1;
-/// Labels up to this are of the background.
+/// Largest label of the background.
 const BACKGROUND: u32 = 3;
 /// Diagonal of the frame that "35 mm equivalent" refers to, millimetres (CIPA DCG-001).
 const FULL_FRAME_DIAGONAL: f64 = 43.266615305567875;
-/// How far the first object moves, in units of the scene: about the size of it.
+/// Displacement of the moved object, in units of the scene: about its size.
 const MOVED: DVec3 = DVec3::new(0.12, 0.05, 0.0);
 
-/// A scene whose photos are spoilt, or not.
+/// Renders the photos of a scene, with the fault of its specification.
 pub(super) struct Photos<'a> {
     scene: &'a SyntheticScene,
     spec: &'a SceneSpec,
-    /// What one or more photos show instead.
+    /// Scene that some of the photos show instead.
     other: Option<SyntheticScene>,
 }
 
-/// Builds the scene of a specification, spoilt in what all photos have in common.
+/// Builds the scene of a specification, with the faults that concern all photos alike.
 pub(super) fn build(spec: &SceneSpec) -> Result<SyntheticScene> {
     let mut scene = build_scene(spec)?;
     match spec.spoil {
@@ -43,8 +43,8 @@ pub(super) fn build(spec: &SceneSpec) -> Result<SyntheticScene> {
     Ok(scene)
 }
 
-/// Puts all photos where the first one is, turned by `step` degrees from one to the next about the
-/// vertical there.
+/// Moves all cameras to the position of the first one and turns each by `step` degrees against the
+/// one before, about the vertical.
 fn turn_in_place(scene: &mut SyntheticScene, step: f64) {
     let middle = (scene.train.len() - 1) as f64 / 2.0;
     let first = scene.train[0].pose;
@@ -67,7 +67,7 @@ impl<'a> Photos<'a> {
         Ok(Photos { scene, spec, other })
     }
 
-    /// What photo `i` shows; its noise is drawn from `seed`.
+    /// Renders photo `i`; its noise is drawn from `seed`.
     pub(super) fn render(&self, i: usize, seed: u64) -> RayCast {
         let alone = i == SPOILT_PHOTO;
         let elsewhere = match self.spec.spoil {
@@ -79,13 +79,13 @@ impl<'a> Photos<'a> {
         if let Some(spoil) = self.spec.spoil {
             spoil.draw_over(&mut seen.image);
             if alone {
-                spoil.picture(&mut seen.image);
+                spoil.spoil_picture(&mut seen.image);
             }
         }
         seen
     }
 
-    /// EXIF data of photo `i`; `None`: its file states nothing.
+    /// EXIF data of photo `i`; `None`: its file has none.
     pub(super) fn exif(&self, i: usize) -> Result<Option<Vec<u8>>> {
         use exif::{Field, In, Tag, Value, experimental::Writer};
         if self.spec.spoil != Some(Spoil::SwappedExif) {
@@ -109,11 +109,14 @@ impl<'a> Photos<'a> {
     }
 }
 
+/// The scene with its first object moved by [`MOVED`].
 fn with_moved_object(scene: &SyntheticScene, unit: f64) -> SyntheticScene {
     let mut moved = scene.clone();
     if let Some(object) = moved.objects.iter_mut().find(|o| o.label > BACKGROUND) {
         match &mut object.shape {
-            Shape::Ball(at, _) | Shape::Block(at, ..) | Shape::Can(at, ..) => *at += MOVED * unit,
+            Shape::Ball(position, _) | Shape::Block(position, ..) | Shape::Can(position, ..) => {
+                *position += MOVED * unit;
+            }
             Shape::Plane(..) => {}
         }
     }
@@ -135,14 +138,14 @@ mod tests {
         (scene, images)
     }
 
-    /// PSNR of every photo and its unspoilt self, dB.
+    /// PSNR of every spoilt photo against the same photo without the fault, dB.
     fn against_plain(spoil: Spoil) -> Vec<f64> {
         let (plain, spoilt) = (photos(None).1, photos(Some(spoil)).1);
         plain.iter().zip(&spoilt).map(|(a, b)| psnr(a, b)).collect()
     }
 
     #[test]
-    fn one_photo_is_spoilt_and_the_others_are_not() {
+    fn single_photo_spoils_change_one_photo() {
         for spoil in [Spoil::Mirrored, Spoil::Moving, Spoil::Defocused, Spoil::Overexposed, Spoil::Black] {
             for (i, psnr) in against_plain(spoil).into_iter().enumerate() {
                 assert_eq!(psnr.is_infinite(), i != SPOILT_PHOTO, "{spoil:?}, photo {i}: {psnr} dB");
@@ -154,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn sets_are_spoilt_as_stated() {
+    fn set_spoils_change_stated_photos() {
         let same = photos(Some(Spoil::Identical)).1;
         assert!(same.iter().all(|p| *p == same[0]));
         let two = against_plain(Spoil::TwoScenes);
@@ -168,12 +171,12 @@ mod tests {
         }
         let axis = |i: usize| turned.train[i].pose.rotation.row(2);
         let step = axis(0).angle_between(axis(1)).to_degrees();
-        // Turned about the vertical, axes that look down move by less than the step of 20 degrees.
+        // A turn about the vertical moves axes that look down by less than the step of 20 degrees.
         assert!((14.0..20.0).contains(&step), "{step}");
     }
 
     #[test]
-    fn files_state_the_focal_length_of_the_other_camera() {
+    fn exif_states_other_cameras_focal_length() {
         let effects = super::super::Effects { focal: true, two_cameras: true, ..Default::default() };
         let spec = SceneSpec {
             seed: 1000,
@@ -184,11 +187,11 @@ mod tests {
         };
         let scene = build(&spec).unwrap();
         let photos = Photos::new(&scene, &spec).unwrap();
-        for (i, of) in [(0, 1), (1, 0), (2, 1)] {
+        for (i, other) in [(0, 1), (1, 0), (2, 1)] {
             let read = exif::Reader::new().read_raw(photos.exif(i).unwrap().unwrap()).unwrap();
             let field = read.get_field(exif::Tag::FocalLengthIn35mmFilm, exif::In::PRIMARY).unwrap();
             let stated = f64::from(field.value.get_uint(0).unwrap()) / FULL_FRAME_DIAGONAL * 800.0;
-            assert!((stated / scene.train[of].fx - 1.0).abs() < 0.02, "{i}: {stated}");
+            assert!((stated / scene.train[other].fx - 1.0).abs() < 0.02, "{i}: {stated}");
         }
         assert!((scene.train[0].fx / scene.train[1].fx - 1.0).abs() > 0.05, "the two differ");
     }

@@ -1,4 +1,4 @@
-//! Queries on features that know the words exactly: those of generated regions.
+//! Queries on features that are the exact text embeddings: those of generated regions.
 use super::regions;
 use splatvk::infer::things;
 use splatvk::query::presence::*;
@@ -6,8 +6,8 @@ use splatvk::query::{TextQuery, field_relevancy};
 use splatvk::scene::{Codebook, Image, LanguageField, LevelField};
 use splatvk_test_support::embedding::{DIM, text_embedding};
 
-/// A scene that shows some phrases, each as one code with the feature of its text, and a speck of
-/// another one.
+/// A language field and a rendered label map that show each phrase as one code with the embedding
+/// of its text, and `speck` in a single pixel.
 fn field(phrases: &[&str], speck: &str) -> (LanguageField, Vec<Image<i32>>) {
     let dim = DIM;
     let embeddings: Vec<f32> = phrases.iter().chain([&speck]).flat_map(|p| text_embedding(p)).collect();
@@ -27,33 +27,34 @@ fn field(phrases: &[&str], speck: &str) -> (LanguageField, Vec<Image<i32>>) {
 }
 
 #[test]
-fn what_is_there_is_found_and_what_is_not_is_not() {
+fn evidence_separates_present_from_absent() {
     let present = ["red book", "blue mug", "lemon", "wooden table", "green can"];
     let (field, maps) = field(&present, "trombone");
     let pixels = ShownPixels::of(&field, &[&maps]);
-    let ask = |text: &str, form: &str| {
+    let evidence = |text: &str, form: &str| {
         let query = regions::query(text);
         let shown = ShownCodes::new(&pixels, &field, &query.canonicals);
         let rows: Vec<f32> = things::of_form(form).iter().flat_map(|o| text_embedding(o)).collect();
         shown.evidence(&query.embedding, &query.alternatives.colours, &shown.background(&rows)).unwrap()
     };
     for (text, form) in [("red book", "red"), ("blue mug", "blue"), ("lemon", ""), ("green can", "green")] {
-        assert_eq!(ask(text, form).presence, Presence::Found, "{text}: {:?}", ask(text, form));
+        assert_eq!(evidence(text, form).presence, Presence::Found, "{text}: {:?}", evidence(text, form));
     }
-    // A speck is nothing, although its code is the phrase itself.
-    assert_ne!(ask("trombone", "").presence, Presence::Found, "{:?}", ask("trombone", ""));
+    // A single pixel is not found, although its code is the phrase itself.
+    assert_ne!(evidence("trombone", "").presence, Presence::Found, "{:?}", evidence("trombone", ""));
     let absent = ["iguana", "sarcophagus", "zeppelin", "turnip", "bollard", "tuba", "pelmet"];
-    let found = absent.iter().filter(|t| ask(t, "").presence == Presence::Found).count();
-    assert!(found <= 1, "{:?}", absent.map(|t| (t, ask(t, "").p_value)));
-    // A thing that is there in another colour is not found.
-    assert_ne!(ask("green mug", "green").presence, Presence::Found, "{:?}", ask("green mug", "green"));
-    // Without the same form every red thing would be a red book.
-    let (same, plain) = (ask("red trombone", "red").p_value, ask("red trombone", "").p_value);
+    let found = absent.iter().filter(|t| evidence(t, "").presence == Presence::Found).count();
+    assert!(found <= 1, "{:?}", absent.map(|t| (t, evidence(t, "").p_value)));
+    // A thing that is present in another colour is not found.
+    let green_mug = evidence("green mug", "green");
+    assert_ne!(green_mug.presence, Presence::Found, "{green_mug:?}");
+    // Without other things of the same form every red thing would pass as a red book.
+    let (same, plain) = (evidence("red trombone", "red").p_value, evidence("red trombone", "").p_value);
     assert!(same > FOUND && plain <= FOUND, "{same} {plain}");
 }
 
 #[test]
-fn nothing_is_said_without_other_things() {
+fn evidence_needs_pixels_and_background() {
     let (field, maps) = field(&["lemon"], "speck");
     let query = regions::query("lemon");
     let pixels = ShownPixels::of(&field, &[&maps]);
@@ -65,7 +66,7 @@ fn nothing_is_said_without_other_things() {
 }
 
 #[test]
-fn a_named_colour_tells_alike_things_apart_where_features_know_it() {
+fn named_colour_separates_similar_things() {
     let phrases = ["yellow brick", "green brick", "lemon"];
     let codebook = Codebook {
         embedding_dim: DIM,
@@ -74,15 +75,16 @@ fn a_named_colour_tells_alike_things_apart_where_features_know_it() {
     };
     let level = LevelField { codebook, ..LevelField::default() };
     let field = LanguageField { levels: vec![level], ..LanguageField::default() };
-    let ask = |text: &str| {
-        let seeing = regions::query(text);
-        let blind = TextQuery { alternatives: Alternatives::default(), ..seeing.clone() };
-        [blind, seeing].map(|q| field_relevancy(&field, &q).unwrap().concat())
+    // Relevancy without and with the same thing in other colours as alternatives.
+    let relevancies = |text: &str| {
+        let with = regions::query(text);
+        let without = TextQuery { alternatives: Alternatives::default(), ..with.clone() };
+        [without, with].map(|q| field_relevancy(&field, &q).unwrap().concat())
     };
-    let [blind, seeing] = ask("yellow brick");
-    assert!(blind[1] > 0.7 && seeing[1] == 0.5, "{blind:?} {seeing:?}");
-    assert_eq!(blind[0], seeing[0]);
-    // There is no red one: what is alike stays the nearest.
-    let [blind, seeing] = ask("red brick");
-    assert_eq!(blind, seeing);
+    let [without, with] = relevancies("yellow brick");
+    assert!(without[1] > 0.7 && with[1] == 0.5, "{without:?} {with:?}");
+    assert_eq!(without[0], with[0]);
+    // No brick is red: bricks of other colours keep their relevancy.
+    let [without, with] = relevancies("red brick");
+    assert_eq!(without, with);
 }

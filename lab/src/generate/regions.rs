@@ -1,5 +1,5 @@
-//! Masks and features made from ground truth, with the errors of segmenters and encoders put in on
-//! purpose.
+//! Masks and features made from ground truth, with injected errors as segmenters and encoders make
+//! them.
 use crate::{Error, Result};
 use glam::{DVec2, DVec3};
 use splatvk::eval::{BACKGROUND_LABELS, GroundTruth, TruthFrame};
@@ -16,43 +16,43 @@ use splatvk_test_support::embedding::{DIM, PHRASE_SHARE, region_feature, text_em
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-/// How often segmentation and description go wrong. Rates are per (view, object, level).
+/// Rates of injected errors of masks and features, per (view, object, level).
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct InjectedErrors {
-    /// Everything below is drawn from this.
+    /// Seed of the errors.
     pub seed: u64,
-    /// A mask of level m or l is cut in two, and the pieces look like pieces.
+    /// Rate of masks of levels m and l that are cut in two; each piece has a feature of its own.
     pub split: f64,
-    /// A mask of level l swallows the object beside it.
+    /// Rate of objects of level l that the mask of a neighbour includes.
     pub merge: f64,
-    /// The feature is that of another object.
+    /// Rate of masks with the feature of another object.
     pub wrong: f64,
     /// Length of the random part of every feature, next to a common part of length 1.
     pub noise: f64,
 }
 
 impl InjectedErrors {
-    /// Exact masks, exact features.
+    /// Exact masks and features.
     pub const NONE: InjectedErrors =
         InjectedErrors { seed: 0, split: 0.0, merge: 0.0, wrong: 0.0, noise: 0.0 };
 
-    /// The rates that `ablate` injects: every fifth mask is cut and every fifth feature mistaken,
-    /// about what the paper's figures show of SAM and CLIP between views far apart.
+    /// Rates that `ablate` injects: every fifth mask is cut and every fifth feature wrong, about as
+    /// often as for SAM and CLIP between distant views in the paper's figures.
     pub fn default_rates(seed: u64) -> InjectedErrors {
         InjectedErrors { seed, split: 0.2, merge: 0.05, wrong: 0.2, noise: 0.35 }
     }
 }
 
-/// Masks with features per view, and the exact feature of every object.
+/// Masks with features per view, and exact features per object.
 #[derive(Clone, Debug, Default)]
 pub struct Regions {
-    /// One per frame, three levels.
+    /// Masks of each frame, three levels.
     pub masks: Vec<ViewMasks>,
-    /// Object index → the exact feature of the whole object.
+    /// Object index → exact feature of the whole object.
     pub embeddings: BTreeMap<u32, Vec<f32>>,
 }
 
-/// A query in this space, with the same thing in other colours beside it as every encoder gives it.
+/// A query in this space; its alternatives are the same thing in other colours, as of any encoder.
 pub fn query(text: &str) -> TextQuery {
     let colours = things::recoloured(text).iter().flat_map(|t| text_embedding(t)).collect();
     TextQuery {
@@ -64,8 +64,8 @@ pub fn query(text: &str) -> TextQuery {
     }
 }
 
-/// Makes regions for frames of a ground truth that has masks; parts of objects need depth and are
-/// left out without it.
+/// Makes regions for frames of a ground truth that has masks. Parts of objects need depth; without
+/// it every object is one part.
 pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErrors) -> Result<Regions> {
     let mut objects = Vec::new();
     for frame in frames {
@@ -84,7 +84,7 @@ pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErro
     for (objects, parts) in objects.iter().zip(&parts) {
         let mut view = ViewMasks::default();
         for level in 0..3 {
-            view.levels.push(one_level(&truth.labels, &names, objects, parts, level, flaws, &mut random));
+            view.levels.push(level_masks(&truth.labels, &names, objects, parts, level, flaws, &mut random));
         }
         masks.push(view);
     }
@@ -95,40 +95,40 @@ pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErro
     Ok(Regions { masks, embeddings: embeddings.collect() })
 }
 
-/// Per frame and pixel the quarter of its object, 0 to 3: signs along the object's two longest axes
-/// in space, so that all views agree.
+/// Quarter of its object, 0 to 3, for every pixel of every frame. The signs along the object's two
+/// longest axes in space define it, so that all views agree.
 fn parts(truth: &GroundTruth, frames: &[&TruthFrame], objects: &[Image<u32>]) -> Result<Vec<Vec<u8>>> {
     let mut points: BTreeMap<u32, Vec<DVec3>> = BTreeMap::new();
-    let mut places = Vec::new();
+    let mut positions = Vec::new();
     for (frame, objects) in frames.iter().zip(objects) {
         let depth = truth.depth(frame)?;
-        let place = |p: usize| {
+        let unproject = |p: usize| {
             let z = depth.as_ref().map_or(0.0, |d| d.data[p]);
             let pixel = DVec2::new((p % objects.width) as f64 + 0.5, (p / objects.width) as f64 + 0.5);
             (z > 0.0).then(|| frame.camera.unproject(pixel, f64::from(z)))
         };
-        let view: Vec<Option<DVec3>> = (0..objects.data.len()).map(place).collect();
+        let view: Vec<Option<DVec3>> = (0..objects.data.len()).map(unproject).collect();
         for (x, &label) in view.iter().zip(&objects.data) {
             points.entry(label).or_default().extend(x);
         }
-        places.push(view);
+        positions.push(view);
     }
     let axes: BTreeMap<u32, (DVec3, [DVec3; 2])> =
         points.into_iter().filter_map(|(label, points)| Some((label, principal(&points)?))).collect();
-    let quarter = |x: &Option<DVec3>, label: &u32| match (x, axes.get(label)) {
-        (Some(x), Some((centre, axes))) => {
-            let side = |k: usize| u8::from(axes[k].dot(*x - *centre) > 0.0);
-            side(0) + 2 * side(1)
-        }
-        _ => 0,
+    let view_quarters = |(positions, objects): (&Vec<Option<DVec3>>, &Image<u32>)| {
+        positions.iter().zip(&objects.data).map(|(x, label)| quarter(*x, axes.get(label))).collect()
     };
-    let view = |(places, objects): (&Vec<Option<DVec3>>, &Image<u32>)| {
-        places.iter().zip(&objects.data).map(|(x, label)| quarter(x, label)).collect()
-    };
-    Ok(places.iter().zip(objects).map(view).collect())
+    Ok(positions.iter().zip(objects).map(view_quarters).collect())
 }
 
-/// Mean and the two directions of largest extent.
+/// Quarter of an object, 0 to 3, in which a point lies; 0 where either is unknown.
+fn quarter(point: Option<DVec3>, object: Option<&(DVec3, [DVec3; 2])>) -> u8 {
+    let (Some(x), Some((centre, axes))) = (point, object) else { return 0 };
+    let side = |k: usize| u8::from(axes[k].dot(x - *centre) > 0.0);
+    side(0) + 2 * side(1)
+}
+
+/// Mean and the two principal directions of largest extent; `None` for fewer than 3 points.
 fn principal(points: &[DVec3]) -> Option<(DVec3, [DVec3; 2])> {
     let n = points.len() as f64;
     if points.len() < 3 {
@@ -147,14 +147,14 @@ fn principal(points: &[DVec3]) -> Option<(DVec3, [DVec3; 2])> {
     let axis = |k: usize| {
         let v = eigen.eigenvectors.column(order[k]);
         let v = DVec3::new(v[0], v[1], v[2]);
-        // one sign whatever the solver returns
+        // The solver's sign is arbitrary.
         if v.dot(DVec3::new(1.0, 0.1, 0.01)) < 0.0 { -v } else { v }
     };
     Some((centre, [axis(0), axis(1)]))
 }
 
-/// The masks of one level: quarters, halves or wholes, flaws included.
-fn one_level(
+/// Masks of one level: quarters, halves or whole objects, with injected errors.
+fn level_masks(
     labels: &BTreeMap<u32, String>,
     names: &[&str],
     objects: &Image<u32>,
@@ -168,8 +168,7 @@ fn one_level(
     let swallowed = swallowed(labels, objects, level, flaws, random);
     for (&label, phrase) in labels {
         let pixels: Vec<usize> = (0..objects.data.len()).filter(|&p| objects.data[p] == label).collect();
-        // Drawn whether or not the object shows, so that one view's visibility does not change the
-        // others' flaws.
+        // Drawn also for hidden objects: visibility in one view must not change errors in others.
         let (cut, mistaken) = (random.uniform() < flaws.split, random.uniform() < flaws.wrong);
         let other = names[random.below(names.len())];
         let background = BACKGROUND_LABELS.contains(&phrase.as_str());
@@ -205,7 +204,7 @@ fn one_level(
     compacted(out)
 }
 
-/// (object that disappears in a neighbour's mask, that neighbour) of level l.
+/// Pairs (object, neighbour whose mask includes it) of level l.
 fn swallowed(
     labels: &BTreeMap<u32, String>,
     objects: &Image<u32>,
@@ -234,7 +233,7 @@ fn swallowed(
     out
 }
 
-/// The pixels left and right of (or above and below) their middle, across the longer side.
+/// Splits pixels at the median of their coordinate along the longer side of their bounding box.
 fn halves(pixels: &[usize], width: usize) -> [Vec<usize>; 2] {
     let (xs, ys): (Vec<usize>, Vec<usize>) = pixels.iter().map(|p| (p % width, p / width)).unzip();
     let span = |v: &[usize]| v.iter().max().unwrap_or(&0) - v.iter().min().unwrap_or(&0);
@@ -248,6 +247,7 @@ fn halves(pixels: &[usize], width: usize) -> [Vec<usize>; 2] {
     [pick(true), pick(false)]
 }
 
+/// Adds a mask with its feature; nothing without pixels.
 fn push(out: &mut LevelMasks, pixels: &[usize], feature: Vec<f32>) {
     if pixels.is_empty() {
         return;
@@ -258,7 +258,7 @@ fn push(out: &mut LevelMasks, pixels: &[usize], feature: Vec<f32>) {
     out.features.extend(feature);
 }
 
-/// Without the masks that are too small to describe, or have been swallowed.
+/// Removes masks below the minimum size, which includes those that a neighbour has swallowed.
 fn compacted(masks: LevelMasks) -> LevelMasks {
     let mut area = vec![0usize; masks.quality.len()];
     masks.labels.data.iter().filter(|&&l| l >= 0).for_each(|&l| area[l as usize] += 1);
@@ -274,12 +274,12 @@ fn compacted(masks: LevelMasks) -> LevelMasks {
     out
 }
 
-/// Of the other things that a query is weighed against every so many are in the table of texts: a
-/// megabyte of them.
+/// Stride over the other things that a query is compared with: the table of texts holds every
+/// fourth, a megabyte.
 const OTHERS_EVERY: usize = 4;
 
-/// Writes regions as a `dir:` folder, with the embeddings of `phrases` and of other things to weigh
-/// them against.
+/// Writes regions as a `dir:` folder, with the embeddings of `phrases` and of other things to
+/// compare them with.
 pub fn write(folder: &Path, frames: &[&TruthFrame], regions: &Regions, phrases: &[String]) -> Result<()> {
     create_folder(folder)?;
     for (frame, view) in frames.iter().zip(&regions.masks) {
@@ -295,9 +295,10 @@ pub fn write(folder: &Path, frames: &[&TruthFrame], regions: &Regions, phrases: 
         npy::write(folder.join(format!("{name}_s.npy")), &labels)?;
         npy::write(folder.join(format!("{name}_f.npy")), &NpyArray::f32(&[first as usize, DIM], features))?;
     }
-    let of_forms = things::forms().flat_map(|form| things::of_form(form).into_iter().step_by(OTHERS_EVERY));
+    let other_things =
+        things::forms().flat_map(|form| things::of_form(form).into_iter().step_by(OTHERS_EVERY));
     let recoloured = phrases.iter().flat_map(|p| things::recoloured(p));
-    let others: BTreeSet<String> = of_forms.chain(recoloured).collect();
+    let others: BTreeSet<String> = other_things.chain(recoloured).collect();
     let new = others.iter().filter(|o| !phrases.contains(o));
     let texts: Vec<&str> = phrases.iter().chain(new).map(String::as_str).chain(CANONICAL_PHRASES).collect();
     let rows: Vec<NpyArray> = texts.iter().map(|t| NpyArray::f32(&[DIM], text_embedding(t))).collect();
@@ -312,25 +313,25 @@ mod tests {
     use splatvk::math::dot_f32 as dot;
 
     fn breakfast() -> GroundTruth {
-        GroundTruth::read(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast"))).unwrap()
+        GroundTruth::read(Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/breakfast"))).unwrap()
     }
 
     #[test]
-    fn cosines_are_those_of_crops_and_phrases() {
+    fn synthetic_cosines_match_crops_and_phrases() {
         let mut random = Random::new(1000);
-        let mut f = |phrase: &str| region_feature(phrase, PHRASE_SHARE, &[], 0.35, &mut random);
-        let (a, b, c) = (f("blue mug"), f("blue mug"), f("lemon"));
+        let mut crop = |phrase: &str| region_feature(phrase, PHRASE_SHARE, &[], 0.35, &mut random);
+        let (a, b, c) = (crop("blue mug"), crop("blue mug"), crop("lemon"));
         assert!((0.85..0.96).contains(&dot(&a, &b)), "same object {}", dot(&a, &b));
         assert!((0.55..0.75).contains(&dot(&a, &c)), "two objects {}", dot(&a, &c));
         let (right, wrong) = (dot(&a, &text_embedding("blue mug")), dot(&a, &text_embedding("green book")));
         assert!(right > 0.18 && right < 0.35 && wrong < 0.12, "{right} {wrong}");
-        // phrases that share a word are alike
-        let t = |p: &str| text_embedding(p);
-        assert!(dot(&t("red can"), &t("red book")) > dot(&t("red can"), &t("blue mug")) + 0.03);
+        // Phrases that share a word are similar.
+        let [can, book, mug] = ["red can", "red book", "blue mug"].map(text_embedding);
+        assert!(dot(&can, &book) > dot(&can, &mug) + 0.03);
     }
 
     #[test]
-    fn without_flaws_every_whole_is_its_object_and_parts_agree_between_views() {
+    fn exact_regions_agree_between_views() {
         let truth = breakfast();
         let frames: Vec<&TruthFrame> = truth.frames.iter().filter(|f| f.split == Split::Train).collect();
         let made = regions(&truth, &frames, &InjectedErrors::NONE).unwrap();
@@ -347,35 +348,35 @@ mod tests {
             assert!(view.levels[0].quality.len() > view.levels[1].quality.len());
             assert!(view.levels[1].quality.len() > whole.quality.len());
         }
-        // the finest masks of two views with one feature are one part: their names are the same
+        // Equal features of two views' finest masks mean the same part.
         let rows = |v: usize| made.masks[v].levels[0].features.chunks_exact(DIM);
         let matched = rows(0).filter(|a| rows(1).any(|b| dot(a, b) > 0.999)).count();
         assert!(matched > 20, "{matched}");
     }
 
     #[test]
-    fn flaws_come_at_their_rates_and_a_seed_repeats_them() {
+    fn injected_errors_follow_rates_and_seed() {
         let truth = breakfast();
         let frames: Vec<&TruthFrame> = truth.frames.iter().collect();
-        let count = |flaws: &InjectedErrors| -> usize {
+        let mask_count = |flaws: &InjectedErrors| -> usize {
             let made = regions(&truth, &frames, flaws).unwrap();
             made.masks.iter().map(|v| v.levels[2].quality.len()).sum()
         };
-        let exact = count(&InjectedErrors::NONE);
-        let split = count(&InjectedErrors { split: 0.5, seed: 1000, ..InjectedErrors::NONE });
-        let merged = count(&InjectedErrors { merge: 0.5, seed: 1000, ..InjectedErrors::NONE });
+        let exact = mask_count(&InjectedErrors::NONE);
+        let split = mask_count(&InjectedErrors { split: 0.5, seed: 1000, ..InjectedErrors::NONE });
+        let merged = mask_count(&InjectedErrors { merge: 0.5, seed: 1000, ..InjectedErrors::NONE });
         // 12 views of 8 objects: 48 more, ± 3 σ of 96 draws
         assert!((split - exact) > 33 && (split - exact) < 63, "{exact} {split}");
         assert!(merged + 5 < exact, "{exact} {merged}");
         let (a, b) = (InjectedErrors::default_rates(1001), InjectedErrors::default_rates(1002));
-        let first =
+        let features =
             |f: &InjectedErrors| regions(&truth, &frames, f).unwrap().masks[0].levels[2].features.clone();
-        assert_eq!(first(&a), first(&a));
-        assert_ne!(first(&a), first(&b));
+        assert_eq!(features(&a), features(&a));
+        assert_ne!(features(&a), features(&b));
     }
 
     #[test]
-    fn a_written_folder_reads_back() {
+    fn write_reads_back() {
         let truth = breakfast();
         let frames: Vec<&TruthFrame> = truth.frames.iter().take(2).collect();
         let made = regions(&truth, &frames, &InjectedErrors::default_rates(1003)).unwrap();

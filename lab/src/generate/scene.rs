@@ -1,5 +1,5 @@
-//! Small scenes with everything known: a table with objects before a wall, or a place out of doors,
-//! and the settings that make them hard.
+//! Small synthetic scenes with exact ground truth: a table with objects before a wall, or a place
+//! outdoors, and the settings that make them hard.
 use super::flat::{self, Flat};
 use super::outdoor::{self, Sky};
 use super::phone::{self, Effects, PhotoEffects};
@@ -11,10 +11,10 @@ use serde::Serialize;
 use splatvk::math::Random;
 use splatvk::scene::{Camera, Pose};
 
-/// What to make and what should be hard about it.
+/// Contents and difficulties of a synthetic scene.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SceneSpec {
-    /// Everything random.
+    /// Seed of all random choices.
     pub seed: u64,
     /// Photos, at least 2.
     pub views: usize,
@@ -28,18 +28,18 @@ pub struct SceneSpec {
     pub baseline: f64,
     /// Contrast of patterns, 1 = plenty to match, 0 = bare surfaces.
     pub texture: f64,
-    /// Strength of highlights, of full white: they move over the surfaces with the camera.
+    /// Strength of highlights, share of full white; they move over the surfaces with the camera.
     pub gloss: f64,
-    /// Thin poles that stand about.
+    /// Thin poles.
     pub thin: usize,
     /// 0 = objects far apart, 1 = close together and behind each other.
     pub occlusion: f64,
-    /// Objects that have a look-alike in another place, by one word of their phrase.
+    /// Look-alikes of other objects; their phrases differ by one word.
     pub similar: usize,
-    /// Standard deviation of the error of the written starting cameras, degrees; positions err
-    /// alike.
+    /// Standard deviation of the pose error of the written starting cameras, degrees; the error of
+    /// positions moves the picture as much.
     pub pose_noise: f64,
-    /// Standard deviation of the photos' noise, in units of full white.
+    /// Standard deviation of the photos' noise, share of full white.
     pub photo_noise: f64,
     /// Whether cameras stand at even steps; otherwise each is up to 2 degrees off along the circle
     /// and 4 above or below it.
@@ -47,15 +47,14 @@ pub struct SceneSpec {
     /// Focal length of the last photo over that of the first; between them it grows from photo to
     /// photo.
     pub zoom: f64,
-    /// Everything on one plane instead.
+    /// Everything on one plane instead of a table.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub flat: Option<Flat>,
-    /// Out of doors, ten times as large: the ground begins at the feet, and behind a house stands
-    /// the sky.
+    /// Outdoors, ten times as large: the ground begins at the feet, the sky stands behind a house.
     pub outdoor: bool,
-    /// Effects of a phone camera on the photos; held-out views then are clean.
+    /// Effects of a phone camera on the photos; held-out views have none.
     pub effects: Effects,
-    /// What is wrong with the photos.
+    /// Fault of the photo set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub spoil: Option<Spoil>,
 }
@@ -86,26 +85,26 @@ impl Default for SceneSpec {
     }
 }
 
-/// A finished scene.
+/// A synthetic scene with its cameras.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SyntheticScene {
     /// Background first.
     pub objects: Vec<SceneObject>,
-    /// Strength of highlights, of full white.
+    /// Strength of highlights, share of full white.
     pub gloss: f64,
-    /// Behind everything, if there is one.
+    /// Sky of outdoor scenes.
     pub sky: Option<Sky>,
     /// True cameras of the photos, without distortion.
     pub train: Vec<Camera>,
-    /// What each photo goes through.
+    /// Camera effects on each photo.
     pub photo_effects: Vec<PhotoEffects>,
     /// True cameras of the held-out views.
     pub test: Vec<Camera>,
-    /// The photos' cameras with errors, to start from.
+    /// Cameras of the photos with pose errors, as a starting point.
     pub noisy: Vec<Camera>,
 }
 
-/// Colour word, colour.
+/// Colour words with their sRGB colours.
 const COLOURS: [(&str, [f64; 3]); 6] = [
     ("red", [0.75, 0.12, 0.1]),
     ("blue", [0.12, 0.25, 0.7]),
@@ -117,37 +116,38 @@ const COLOURS: [(&str, [f64; 3]); 6] = [
 const NOUNS: [&str; 6] = ["ball", "box", "can", "book", "brick", "drum"];
 
 impl SceneSpec {
-    /// Metres from the cameras to the middle of the scene, about.
+    /// Approximate distance from the cameras to the middle of the scene, metres.
     pub(super) fn unit(&self) -> f64 {
         if self.outdoor { outdoor::SCALE } else { 1.0 }
     }
 
     fn check(&self) -> Result<()> {
-        let bad = |what: &str| Err(Error::input(format!("generate: {what}")));
-        match self {
-            k if k.views < 2 => bad("--views: at least 2"),
-            k if !(1..=12).contains(&k.objects) => bad("--objects: 1 to 12"),
-            k if k.similar > k.objects / 2 => bad("--similar: at most half of --objects"),
+        let reason = match self {
+            k if k.views < 2 => "--views: at least 2",
+            k if !(1..=12).contains(&k.objects) => "--objects: 1 to 12",
+            k if k.similar > k.objects / 2 => "--similar: at most half of --objects",
             k if k.size.0.min(k.size.1) < 64 || k.size.0.max(k.size.1) > 4096 => {
-                bad("--size: 64 to 4096 pixels a side")
+                "--size: 64 to 4096 pixels a side"
             }
-            k if !(1.0..=80.0).contains(&k.baseline) => bad("--baseline: 1 to 80 degrees"),
-            k if !(0.25..=4.0).contains(&k.zoom) => bad("--zoom: 0.25 to 4"),
+            k if !(1.0..=80.0).contains(&k.baseline) => "--baseline: 1 to 80 degrees",
+            k if !(0.25..=4.0).contains(&k.zoom) => "--zoom: 0.25 to 4",
             k if k.flat.is_some() && (k.outdoor || k.similar + k.thin > 0) => {
-                bad("--flat holds sheets alone: without --outdoor, --similar and --thin")
+                "--flat holds sheets alone: without --outdoor, --similar and --thin"
             }
             k if [k.occlusion, k.texture, k.gloss].iter().any(|v| !(0.0..=1.0).contains(v)) => {
-                bad("--occlusion, --texture and --gloss: 0 to 1")
+                "--occlusion, --texture and --gloss: 0 to 1"
             }
             k if k.pose_noise < 0.0 || !(0.0..=0.5).contains(&k.photo_noise) => {
-                bad("--pose-noise: 0 or more; --photo-noise: 0 to 0.5")
+                "--pose-noise: 0 or more; --photo-noise: 0 to 0.5"
             }
-            _ => Ok(()),
-        }
+            _ => return Ok(()),
+        };
+        Err(Error::input(format!("generate: {reason}")))
     }
 }
 
-/// Builds the scene of a specification.
+/// Builds the scene of a specification; an error where an option is out of range or the objects do
+/// not fit on the table.
 pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
     spec.check()?;
     let mut random = Random::new(spec.seed ^ 0x5ce7e);
@@ -186,7 +186,7 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
             Some(way) => pinhole(spec, &name, flat::pose(way, azimuth, &mut random)),
             None => camera(spec, &name, azimuth, 25.0 + 18.0 * random.uniform()),
         };
-        // The same phone, with its principal point in the middle.
+        // Focal length of the first photo; the principal point is the middle of the picture.
         let (fx, fy) = train.first().map_or((made.fx, made.fy), |c| (c.fx, c.fy));
         Camera { fx, fy, ..made }
     });
@@ -194,7 +194,7 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
     let (sigma, unit) = (spec.pose_noise.to_radians(), spec.unit());
     let noisy = train.iter().map(|c| {
         let mut draw = || DVec3::new(random.normal(), random.normal(), random.normal()) * sigma;
-        // The scene is about one unit away: an angle moves the picture as much as that length does.
+        // The scene is about one unit away, so rotations and translations move the picture equally.
         let error = Pose::exp(unit * draw(), draw());
         Camera { pose: error.compose(&c.pose), ..c.clone() }
     });
@@ -202,6 +202,7 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
     Ok(SyntheticScene { objects, gloss: spec.gloss, sky, train, photo_effects, test, noisy })
 }
 
+/// Table, wall and carpet of an indoor scene, labels 1 to 3.
 fn background(spec: &SceneSpec, random: &mut Random) -> Vec<SceneObject> {
     let mut object = |label, phrase: &str, shape, colour, grain| SceneObject {
         label,
@@ -217,20 +218,20 @@ fn background(spec: &SceneSpec, random: &mut Random) -> Vec<SceneObject> {
     ]
 }
 
-/// Objects whose middle is so far from the table's, in units, still stand on it.
+/// Largest distance of an object from the middle of the table, in units of the scene.
 const TABLE: f64 = 0.5;
 
-/// Names and solids, placed without overlap; look-alikes and poles last.
+/// Adds named objects without overlap; look-alikes and poles come last.
 fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneObject>) -> Result<()> {
     let mut names: Vec<(usize, usize)> =
         (0..COLOURS.len()).flat_map(|c| (0..NOUNS.len()).map(move |n| (c, n))).collect();
     random.shuffle(&mut names);
     let kinds = spec.objects - spec.similar;
     let unit = spec.unit();
-    // As close together as asked; where there is no room left, as near to that as they fit on the
-    // table.
-    let asked = 0.42 - 0.16 * spec.occlusion;
-    let reaches = || (0..).map(|i| asked + 0.04 * f64::from(i)).take_while(|r| *r <= TABLE).map(|r| r * unit);
+    // Radius that --occlusion asks for; where no room is left, it grows in steps up to the table.
+    let closest = 0.42 - 0.16 * spec.occlusion;
+    let reaches =
+        || (0..).map(|i| closest + 0.04 * f64::from(i)).take_while(|r| *r <= TABLE).map(|r| r * unit);
     let mut taken: Vec<(DVec2, f64)> = Vec::new();
     for (label, k) in (4..).zip(0..spec.objects + spec.thin) {
         let like = k.checked_sub(kinds).filter(|_| k < spec.objects);
@@ -245,34 +246,35 @@ fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneO
         };
         let (footprint, make) = solid(noun, unit, random);
         let gap = (0.05 * (1.0 - spec.occlusion) + 0.01) * unit;
-        let at = reaches().flat_map(|reach| std::iter::repeat_n(reach, 2000)).find_map(|reach| {
+        let position = reaches().flat_map(|reach| std::iter::repeat_n(reach, 2000)).find_map(|reach| {
             let p = DVec2::new(random.uniform() - 0.5, random.uniform() - 0.5)
                 * 2.0
                 * DVec2::new(reach, 0.85 * reach);
             taken.iter().all(|(q, r)| p.distance(*q) > footprint + r + gap).then_some(p)
         });
-        let Some(at) = at else {
+        let Some(position) = position else {
             return Err(Error::input(
                 "generate: no room for so many objects; lower --objects or --occlusion",
             ));
         };
-        taken.push((at, footprint));
+        taken.push((position, footprint));
         let contrast = if noun == "pole" { 0.2 } else { 0.7 } * spec.texture;
         objects.push(SceneObject {
             label,
             phrase,
-            shape: make(at),
+            shape: make(position),
             paint: paint(colour, contrast, 0.03 * unit, random),
         });
     }
     Ok(())
 }
 
+/// Suffix of the phrase of pole `k`, counted from 0: none for the first one.
 fn number(k: usize) -> String {
     if k == 0 { String::new() } else { format!(" {}", k + 1) }
 }
 
-/// Radius on the table, and the solid once its place is known.
+/// A solid of random size: its radius on the table, and a function from its position to the solid.
 fn solid(noun: &str, unit: f64, random: &mut Random) -> (f64, Box<dyn Fn(DVec2) -> Shape>) {
     let size = (0.85 + 0.3 * random.uniform()) * unit;
     let turn = random.uniform() * std::f64::consts::PI;
@@ -290,13 +292,13 @@ fn solid(noun: &str, unit: f64, random: &mut Random) -> (f64, Box<dyn Fn(DVec2) 
         "brick" => block(0.07, 0.035, 0.03),
         "can" => (0.035 * size, Box::new(move |p| Shape::Can(p.extend(0.0), 0.035 * size, 0.12 * size))),
         "drum" => (0.065 * size, Box::new(move |p| Shape::Can(p.extend(0.0), 0.065 * size, 0.06 * size))),
-        // a pole of 8 mm is 4 pixels wide at the usual size
+        // A pole of 8 mm is 4 pixels wide at the default picture size.
         _ => (0.02 * unit, Box::new(move |p| Shape::Can(p.extend(0.0), 0.004 * unit, 0.24 * unit))),
     }
 }
 
-/// A camera on a sphere around the middle of the scene, looking at it; `elevation` is that over a
-/// table.
+/// A camera on a sphere around the middle of the scene, which it looks at; angles in degrees.
+/// `elevation` is that of a table scene; outdoors it is scaled to [`outdoor::ELEVATION`].
 fn camera(spec: &SceneSpec, name: &str, azimuth: f64, elevation: f64) -> Camera {
     let (target, elevation) = match spec.outdoor {
         true => (DVec3::new(0.0, 0.0, 0.12), outdoor::ELEVATION * elevation / 32.0),
@@ -311,7 +313,7 @@ fn camera(spec: &SceneSpec, name: &str, azimuth: f64, elevation: f64) -> Camera 
     pinhole(spec, name, Pose { rotation, translation: -(rotation * centre) })
 }
 
-/// The usual pinhole at a pose.
+/// The default pinhole at a pose: focal length 1.025 widths.
 fn pinhole(spec: &SceneSpec, name: &str, pose: Pose) -> Camera {
     let (width, height) = spec.size;
     let f = 1.025 * f64::from(width);

@@ -16,22 +16,22 @@ pub enum Shape {
     Plane(DVec3, f64),
 }
 
-/// Where a ray meets a solid.
+/// Intersection of a ray with a solid.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hit {
     /// Ray parameter.
     pub t: f64,
     /// Unit normal, outwards.
     pub normal: DVec3,
-    /// Position in the solid's own coordinates, metres; colours are painted there.
+    /// Position in the solid's own coordinates, metres, at which its paint is evaluated.
     pub place: DVec3,
 }
 
-/// Hits nearer than this are the ray's own start.
+/// Smallest ray parameter of a hit; smaller ones are the start of the ray itself.
 const NEAR: f64 = 1e-6;
 
 impl Shape {
-    /// The first hit of a ray from outside.
+    /// First hit of a ray that starts outside.
     pub fn hit(&self, from: DVec3, ray: DVec3) -> Option<Hit> {
         match *self {
             Shape::Ball(centre, radius) => {
@@ -42,7 +42,7 @@ impl Shape {
                 (t > NEAR).then(|| Hit { t, normal: place / radius, place })
             }
             Shape::Block(centre, half, turn) => {
-                let (o, d) = (turned(from - centre, -turn), turned(ray, -turn));
+                let (o, d) = (rotated(from - centre, -turn), rotated(ray, -turn));
                 let (a, b) = ((-half - o) / d, (half - o) / d);
                 let (enter, leave) = (a.min(b), a.max(b));
                 let t = enter.max_element();
@@ -56,7 +56,7 @@ impl Shape {
                 } else {
                     DVec3::Z
                 };
-                Some(Hit { t, normal: turned(-axis * d.signum(), turn), place: o + d * t })
+                Some(Hit { t, normal: rotated(-axis * d.signum(), turn), place: o + d * t })
             }
             Shape::Can(base, radius, height) => can(from - base, ray, radius, height),
             Shape::Plane(n, offset) => {
@@ -71,27 +71,29 @@ impl Shape {
     }
 }
 
-fn turned(v: DVec3, angle: f64) -> DVec3 {
+/// Rotates a vector about +z by an angle in radians.
+fn rotated(v: DVec3, angle: f64) -> DVec3 {
     let (s, c) = angle.sin_cos();
     DVec3::new(c * v.x - s * v.y, s * v.x + c * v.y, v.z)
 }
 
+/// First hit of the ray o + t d with a cylinder on the origin, axis +z.
 fn can(o: DVec3, d: DVec3, radius: f64, height: f64) -> Option<Hit> {
     let (o2, d2) = (DVec2::new(o.x, o.y), DVec2::new(d.x, d.y));
     let (a, b, c) = (d2.length_squared(), o2.dot(d2), o2.length_squared() - radius * radius);
     let side = (-b - (b * b - a * c).sqrt()) / a;
-    let at = |t: f64| o + d * t;
-    if side > NEAR && (0.0..=height).contains(&at(side).z) {
-        let p = at(side);
+    let point = |t: f64| o + d * t;
+    if side > NEAR && (0.0..=height).contains(&point(side).z) {
+        let p = point(side);
         return Some(Hit { t: side, normal: DVec3::new(p.x, p.y, 0.0) / radius, place: p });
     }
     let (level, normal) = if d.z < 0.0 { (height, DVec3::Z) } else { (0.0, -DVec3::Z) };
     let t = (level - o.z) / d.z;
-    let p = at(t);
+    let p = point(t);
     (t > NEAR && DVec2::new(p.x, p.y).length() <= radius).then_some(Hit { t, normal, place: p })
 }
 
-/// What a surface looks like.
+/// Colour and pattern of a surface.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Paint {
     /// Mean sRGB colour in [0, 1].
@@ -100,31 +102,31 @@ pub struct Paint {
     pub contrast: f64,
     /// Side of the pattern's largest blocks, metres.
     pub grain: f64,
-    /// Distinguishes patterns.
+    /// Seed of the pattern.
     pub seed: u64,
-    /// Side of the tile after which the pattern begins anew, metres; `None`: it never does.
+    /// Period of the pattern, metres; `None`: it does not repeat.
     pub tile: Option<f64>,
 }
 
-/// An object with a name.
+/// An object with its phrase.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SceneObject {
     /// Index in the masks.
     pub label: u32,
-    /// What it is called.
+    /// Text that names it.
     pub phrase: String,
-    /// Its solid.
+    /// Solid.
     pub shape: Shape,
-    /// Its surface.
+    /// Surface.
     pub paint: Paint,
 }
 
-/// A surface with a pattern of its own.
+/// A surface with a new pattern.
 pub(super) fn paint(colour: [f64; 3], contrast: f64, grain: f64, random: &mut Random) -> Paint {
     Paint { colour, contrast, grain, seed: random.bits(), tile: None }
 }
 
-/// A number in [−1, 1] that belongs to a cell.
+/// Pseudo-random number in [−1, 1] of the unit cell that contains `p`.
 fn cell(p: DVec3, seed: u64) -> f64 {
     let q = p.floor();
     let mut h = seed ^ 0x9e37_79b9_7f4a_7c15;
@@ -132,14 +134,14 @@ fn cell(p: DVec3, seed: u64) -> f64 {
         h = (h ^ (v as i64 as u64)).wrapping_mul(0xff51_afd7_ed55_8ccd);
         h ^= h >> 32;
     }
-    // The last product leaves neighbours with nearly equal upper bits; one more mixes them.
+    // After the last product the upper bits of neighbours are nearly equal; one more mixes them.
     h = h.wrapping_mul(0xc4ce_b9fe_1a85_ec53);
     h ^= h >> 32;
     (h >> 11) as f64 / (1u64 << 52) as f64 - 1.0
 }
 
-/// The numbers of the eight nearest cells, mixed without a step.
-fn between_cells(p: DVec3, seed: u64) -> f64 {
+/// Smooth interpolation of the numbers of the eight nearest cells.
+fn interpolated_cells(p: DVec3, seed: u64) -> f64 {
     let low = p.floor();
     let t = p - low;
     let t = t * t * (3.0 - 2.0 * t);
@@ -152,21 +154,21 @@ fn between_cells(p: DVec3, seed: u64) -> f64 {
 }
 
 impl Paint {
-    /// Colour at a place: blocks of three sizes, so that there are corners to match at any
+    /// sRGB colour at a position: blocks of three sizes, so that corners can be matched at any
     /// distance.
     pub fn at(&self, place: DVec3) -> [f64; 3] {
-        // Off the faces of solids that lie on a cell border, where rounding would draw noise.
+        // Faces of solids lie on cell borders; the offset keeps rounding from drawing noise there.
         let p = place + DVec3::new(0.000_31, 0.000_17, 0.000_23);
         let p = self.tile.map_or(p, |side| p.map(|v| v.rem_euclid(side)));
         self.with_pattern(p, cell)
     }
 
-    /// The same with soft edges, as clouds have.
+    /// sRGB colour at a position, with soft edges as clouds have.
     pub fn smooth(&self, place: DVec3) -> [f64; 3] {
-        self.with_pattern(place, between_cells)
+        self.with_pattern(place, interpolated_cells)
     }
 
-    /// Colour times a pattern of three sizes.
+    /// Mean colour modulated by the sum of a pattern at three sizes.
     fn with_pattern(&self, place: DVec3, pattern: impl Fn(DVec3, u64) -> f64) -> [f64; 3] {
         let sum: f64 = [(1.0, 0.5), (0.37, 0.3), (0.13, 0.2)]
             .into_iter()
@@ -184,22 +186,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn neighbouring_cells_differ_along_every_axis() {
+    fn cell_is_independent_of_neighbours() {
         // The mean difference of two independent numbers in [−1, 1] is 2/3.
         for axis in [DVec3::X, DVec3::Y, DVec3::Z] {
-            let at = |i: i32| DVec3::new(f64::from(i % 9), f64::from(i / 9 % 9), f64::from(i / 81));
-            let differences = (0..729).map(|i| (cell(at(i), 1005) - cell(at(i) + axis, 1005)).abs());
+            let corner = |i: i32| DVec3::new(f64::from(i % 9), f64::from(i / 9 % 9), f64::from(i / 81));
+            let differences = (0..729).map(|i| (cell(corner(i), 1005) - cell(corner(i) + axis, 1005)).abs());
             let mean = differences.sum::<f64>() / 729.0;
             assert!((mean - 2.0 / 3.0).abs() < 0.06, "{axis} {mean}");
         }
     }
 
-    /// Inside or on the solid, by its definition.
+    /// Whether a point lies inside or on the solid, by its definition.
     fn contains(shape: &Shape, p: DVec3) -> bool {
         match *shape {
             Shape::Ball(c, r) => (p - c).length() <= r,
             Shape::Block(c, h, turn) => {
-                let q = turned(p - c, -turn).abs();
+                let q = rotated(p - c, -turn).abs();
                 q.x <= h.x && q.y <= h.y && q.z <= h.z
             }
             Shape::Can(b, r, h) => {
@@ -211,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn a_hit_is_where_marching_first_meets_the_solid() {
+    fn hit_matches_ray_marching() {
         let shapes = [
             Shape::Ball(DVec3::new(0.1, 0.2, 0.3), 0.25),
             Shape::Block(DVec3::new(-0.1, 0.1, 0.2), DVec3::new(0.3, 0.1, 0.2), 0.7),
@@ -238,7 +240,7 @@ mod tests {
                         hits += 1;
                     }
                     (None, None) => {}
-                    // marching steps over corners thinner than a step
+                    // Marching skips corners thinner than a step.
                     (None, Some(h)) => {
                         assert!(!contains(shape, from + ray * (h.t + 2.0 * step)), "{shape:?} {h:?}")
                     }

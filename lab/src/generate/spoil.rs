@@ -1,5 +1,5 @@
-//! Photo sets of which no right scene, or only part of one, can be made: a run must refuse them,
-//! warn of the photo, or come out right all the same (docs/internals/trust.md#photo-sets).
+//! Faulty photo sets, of which no correct scene or only part of one can be made. A run must refuse
+//! them, warn of the photo, or be correct all the same (docs/internals/trust.md#photo-sets).
 use super::{to_linear, to_srgb};
 use rayon::prelude::*;
 use serde::Serialize;
@@ -8,14 +8,14 @@ use splatvk::scene::{Camera, RgbImage};
 
 /// Standard deviation of defocus over the width: details of a hundredth of the picture are lost.
 const DEFOCUS: f64 = 0.01;
-/// Stops of over-exposure: what was darker than an eighth of white is all that is left.
+/// Stops of over-exposure: everything brighter than an eighth of white is clipped.
 const OVEREXPOSURE: f64 = 3.0;
 
-/// What is wrong with a set of photos.
+/// Fault of a photo set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Spoil {
-    /// Every photo is taken where the first one is, as from a tripod.
+    /// All photos have the pose of the first one, as from a tripod.
     Identical,
     /// One photo is mirrored left to right.
     Mirrored,
@@ -54,7 +54,7 @@ pub enum Spoil {
 }
 
 impl Spoil {
-    /// Every way, its name and what it does.
+    /// All variants with their names and help texts.
     pub const ALL: [(Spoil, &str, &str); 18] = [
         (Spoil::Identical, "identical", "Every photo shows what the first one does; their noise differs"),
         (Spoil::Mirrored, "mirrored", "The second photo is mirrored left to right"),
@@ -84,8 +84,8 @@ impl Spoil {
         (Spoil::Bonnet, "bonnet", "The bonnet of a car in the lower part of every photo"),
     ];
 
-    /// Spoils a photo that is spoilt as a picture; others stay what they are.
-    pub(super) fn picture(self, image: &mut RgbImage) {
+    /// Applies the faults of a single picture; the other variants leave it unchanged.
+    pub(super) fn spoil_picture(self, image: &mut RgbImage) {
         let width = image.width;
         match self {
             Spoil::Mirrored => image.data.chunks_mut(width).for_each(<[_]>::reverse),
@@ -101,24 +101,25 @@ impl Spoil {
     }
 }
 
-/// Size of the whole photo over that of the part cut out of it.
+/// Range of the size of the whole photo over that of the part cut out of it.
 const WHOLE: (f64, f64) = (1.25, 1.6);
-/// How far off its middle the part lies at least, of what fits into the whole.
+/// Smallest offset of the part from the middle, share of the largest one that fits.
 const OFF: f64 = 0.6;
 
-/// Makes a camera one of the same pixels whose photo is cut out of a larger one.
+/// Changes a camera to that of a photo with the same number of pixels, cut out of a larger one.
 pub(super) fn crop(camera: &mut Camera, seed: u64) {
     let mut random = Random::new(seed ^ 0xc20);
     let whole = WHOLE.0 + (WHOLE.1 - WHOLE.0) * random.uniform();
-    let mut off = || {
+    let mut offset = || {
         let share = OFF + (1.0 - OFF) * random.uniform();
         0.5 * (whole - 1.0) * if random.uniform() < 0.5 { -share } else { share }
     };
-    camera.cx += off() * f64::from(camera.width);
-    camera.cy += off() * f64::from(camera.height);
+    camera.cx += offset() * f64::from(camera.width);
+    camera.cy += offset() * f64::from(camera.height);
     (camera.fx, camera.fy) = (camera.fx * whole, camera.fy * whole);
 }
 
+/// Gaussian blur with a standard deviation in pixels.
 fn blurred(image: &RgbImage, sigma: f64) -> RgbImage {
     let flat: Vec<f32> = image.data.iter().flatten().copied().collect();
     let Some(buffer) =

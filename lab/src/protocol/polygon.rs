@@ -1,6 +1,6 @@
 //! Polygons to masks as in the label tools of LERF-OVS: vertices truncated to whole pixels,
 //! even-odd interior, outline included (OpenCV's `fillPoly`).
-use crate::scene::Image;
+use splatvk::scene::Image;
 
 /// Farthest that a vertex may lie outside, pixels: beyond it products of coordinates exceed 64
 /// bits.

@@ -1,7 +1,7 @@
 //! Labels of the published layouts as one object index per pixel: ground truth for masks and
 //! features.
-use crate::eval::ObjectMaps;
-use crate::scene::{Camera, Image};
+use splatvk::eval::ObjectMaps;
+use splatvk::scene::{Camera, Image};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

@@ -4,7 +4,7 @@
 //! [`open`] reads a data set's labels and lists the cameras to render and the texts to query; the
 //! caller renders and decodes each frame and passes it to [`Protocol::add`]; [`Protocol::finish`]
 //! returns the scores with their definitions. The project's own protocol, `field`, is
-//! [`crate::eval`].
+//! [`splatvk::eval`].
 mod labels;
 mod lerf;
 mod ovs;
@@ -22,7 +22,7 @@ pub use score::{
 };
 
 use crate::Result;
-use crate::scene::Camera;
+use splatvk::scene::Camera;
 use std::path::Path;
 
 /// Reads the labels of a folder, frame by frame.

@@ -5,9 +5,11 @@ use super::score::{
     DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score,
     labelled_views, mask_iou, mean, nearest, summarise,
 };
-use crate::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, ObjectMaps, Split};
-use crate::scene::{Camera, Image};
-use crate::{Error, Result, files, photo};
+use crate::{Error, Result};
+use splatvk::eval::{BACKGROUND_LABELS, MIN_OBJECT_PIXELS, ObjectMaps, Split};
+use splatvk::photo;
+use splatvk::scene::{Camera, Image};
+use splatvk_types::files;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

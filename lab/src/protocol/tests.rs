@@ -1,10 +1,10 @@
 //! Each protocol against a plain computation in f64 that shares no code with it.
 use super::*;
-use crate::eval::{GroundTruth, Split};
-use crate::math::Random;
-use crate::query::TextQuery;
-use crate::scene::{Codebook, Image, LanguageField, LevelField, Pose};
 use glam::DVec3;
+use splatvk::eval::{GroundTruth, Split};
+use splatvk::math::Random;
+use splatvk::query::TextQuery;
+use splatvk::scene::{Codebook, Image, LanguageField, LevelField, Pose};
 
 fn unit(random: &mut Random) -> Vec<f32> {
     let v: Vec<f64> = (0..3).map(|_| random.uniform() - 0.5).collect();

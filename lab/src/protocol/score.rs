@@ -1,12 +1,12 @@
 //! Frames and scores of all protocols, and the decoded views of a scene.
-use crate::eval::{Evaluation, GroundTruth, Split, to_scene};
-use crate::photo::{join, stem};
-use crate::pose::align::pose_errors;
-use crate::query::{TextQuery, field_relevancy, relevancy_map};
-use crate::scene::{Camera, Image, LanguageField};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use serde::Serialize;
+use splatvk::eval::{Evaluation, GroundTruth, Split, to_scene};
+use splatvk::photo::{join, stem};
+use splatvk::pose::align::pose_errors;
+use splatvk::query::{TextQuery, field_relevancy, relevancy_map};
+use splatvk::scene::{Camera, Image, LanguageField};
 use std::collections::BTreeMap;
 use std::path::Path;
 

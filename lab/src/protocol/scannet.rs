@@ -4,11 +4,12 @@ use super::score::{
     DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary, Score,
     labelled_views, nearest,
 };
-use crate::eval::{ObjectMaps, Split};
-use crate::photo::{self, stem};
-use crate::scene::{Camera, Image, Pose};
-use crate::{Error, Result, files};
+use crate::{Error, Result};
 use glam::{DMat3, DVec3};
+use splatvk::eval::{ObjectMaps, Split};
+use splatvk::photo::{self, stem};
+use splatvk::scene::{Camera, Image, Pose};
+use splatvk_types::files;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

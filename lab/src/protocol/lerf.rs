@@ -6,11 +6,12 @@ use super::score::{
     DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score,
     labelled_views, mask_iou, mean, summarise,
 };
-use crate::eval::{MIN_OBJECT_PIXELS, ObjectMaps};
-use crate::query::filter;
-use crate::scene::{Camera, Image, MAX_PIXELS};
-use crate::{Error, Result, files};
+use crate::{Error, Result};
 use serde::Deserialize;
+use splatvk::eval::{MIN_OBJECT_PIXELS, ObjectMaps};
+use splatvk::query::filter;
+use splatvk::scene::{Camera, Image, MAX_PIXELS};
+use splatvk_types::files;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
