@@ -1,25 +1,31 @@
-/* splatvk: a few photos without camera poses to a Gaussian-splat scene that answers text queries.
+/* splatvk: makes a Gaussian-splat scene that answers text queries from a few photos without camera
+ * poses.
  *
  * Generated from src/capi by cbindgen; do not edit.
  *
  * Rules for all functions
- * - Handles (SvkContext, SvkScene) are opaque. A handle comes from one function and ends with its _destroy. Scenes keep what
- *   they need of their context, which may end before them.
- * - Functions return a SvkStatus. After anything but SVK_STATUS_OK the handle keeps a text of one line that says what was
- *   wrong, where, and what to do. When even the handle is NULL, there is only SVK_STATUS_ARGUMENT.
- * - Structures begin with their size. Fill them with zeros, set `size` to sizeof the structure, then set what you need: zero
- *   is the default of every field. Structures that are filled for you need their `size` set, too.
- * - Texts are UTF-8 and end with a zero byte. Pointers that you give are used during the call only.
- * - Every function may be called from any thread; where it says so, calls with one handle wait for each other. A handle
- *   must not be destroyed while another call with it runs.
- * - A child process after fork() has none of the threads and no device: there, call nothing but exec functions and _exit.
- * - Texts that you ask have at most 300 characters and 40 words; other texts and paths have at most 65,536 bytes.
- * - Nothing is thrown or unwound into your code, and nothing may be thrown out of your callbacks.
- * - Vulkan handles are given as void * (VkInstance, VkPhysicalDevice, VkDevice, VkQueue) and uint64_t (VkBuffer, VkImage,
- *   VkSemaphore), so that this header needs no other one.
+ * - Handles (SvkContext, SvkScene) are opaque. Each is created by one function and destroyed by its
+ *   _destroy function. A context may be destroyed before its scenes.
+ * - Functions return an SvkStatus. After any other status than SVK_STATUS_OK the handle keeps an
+ *   error text of one line: the error, its place, and the remedy. For a handle that is NULL there
+ *   is no text, only SVK_STATUS_ARGUMENT.
+ * - Structures begin with their size. Fill them with zeros, set `size` to the sizeof of the
+ *   structure, then set other fields; zero is the default of every field. Set `size` of output
+ *   structures, too.
+ * - Texts are UTF-8 and end with a zero byte. Functions use the caller's pointers during the call
+ *   only, except lock_queue, unlock_queue and user of SvkVulkanDevice.
+ * - Every function may be called from any thread. Where its comment says so, calls with one handle
+ *   are serialised. A handle must not be destroyed while another call with it runs.
+ * - After fork() the child process has none of the threads and no device; it must call only exec
+ *   functions and _exit.
+ * - Query texts have at most 300 characters and 40 words, other texts and paths at most 65,536
+ *   bytes.
+ * - No function throws or unwinds into the caller, and callbacks must not throw.
+ * - Vulkan handles are void * (VkInstance, VkPhysicalDevice, VkDevice, VkQueue) or uint64_t
+ *   (VkBuffer, VkImage, VkSemaphore), so that this header includes no other one.
  *
- * Version: compare svk_abi_version() with SVK_ABI_VERSION; the upper 16 bits must agree and the lower ones of the library must
- * not be smaller. */
+ * Version: the upper 16 bits of svk_abi_version() and SVK_ABI_VERSION must be equal, and the lower
+ * 16 bits of svk_abi_version() must not be smaller. */
 
 
 #pragma once
@@ -28,14 +34,14 @@
 #include <stdint.h>
 
 /*
- Version of this interface: major × 65536 + minor. A program runs with any library of the same major version and the
- same or a higher minor one.
+ Version of this interface: major × 65536 + minor. A program works with any library of the same
+ major version and the same or a higher minor version.
  */
 #define SVK_ABI_VERSION 65536
 
 /*
- What a function returns. Anything but `SVK_STATUS_OK` leaves a text behind: svk_context_error,
- svk_scene_error.
+ Result of a function. After any other status than SVK_STATUS_OK, svk_context_error or
+ svk_scene_error returns a text.
  */
 enum SvkStatus
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -43,11 +49,11 @@ enum SvkStatus
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     Done.
+     Success.
      */
     SVK_STATUS_OK = 0,
     /*
-     What was given cannot be used; the text says what and why.
+     The input cannot be used; the text names it and the reason.
      */
     SVK_STATUS_INPUT = 1,
     /*
@@ -59,23 +65,24 @@ enum SvkStatus
      */
     SVK_STATUS_MISSING = 3,
     /*
-     The Vulkan device or driver refused something, other than the codes from 9 on.
+     An error of the Vulkan device or driver without a code of its own (9 to 11).
      */
     SVK_STATUS_GPU = 4,
     /*
-     Something failed while working on valid input.
+     Work on valid input failed.
      */
     SVK_STATUS_WORK = 5,
     /*
-     The progress callback asked to stop; nothing was made or written.
+     The progress callback stopped the work; nothing was made or written.
      */
     SVK_STATUS_CANCELLED = 6,
     /*
-     A pointer is null or a structure's size is wrong: a mistake in the calling program.
+     An argument is invalid, such as a null pointer or a wrong structure size: an error of the
+     calling program.
      */
     SVK_STATUS_ARGUMENT = 7,
     /*
-     A mistake in splatvk. The handle may be destroyed, and nothing else should be done with it.
+     An error in splatvk. The handle can only be destroyed.
      */
     SVK_STATUS_INTERNAL = 8,
     /*
@@ -89,16 +96,16 @@ enum SvkStatus
      */
     SVK_STATUS_OUT_OF_DEVICE_MEMORY = 10,
     /*
-     No Vulkan loader, driver or device that can be used.
+     There is no usable Vulkan loader, driver or device.
      */
     SVK_STATUS_NO_DEVICE = 11,
     /*
-     A model, or a file of it, is missing or not what it is used for.
+     A model, or a file of it, is missing or unsuitable.
      */
     SVK_STATUS_MISSING_MODEL = 12,
     /*
-     A file cannot be written: the disk is full, or the folder does not allow it. Nothing
-     half-written stays.
+     A file cannot be written: the disk is full, or the folder is not writable. No partial file
+     remains.
      */
     SVK_STATUS_UNWRITABLE = 13,
 };
@@ -111,7 +118,7 @@ typedef int32_t SvkStatus;
 #endif // __cplusplus
 
 /*
- Time against quality.
+ Trade-off between time and quality.
  */
 enum SvkPreset
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -119,11 +126,11 @@ enum SvkPreset
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     Draft on a CPU device, default on a GPU.
+     SVK_PRESET_DRAFT on a CPU device, SVK_PRESET_DEFAULT on a GPU.
      */
     SVK_PRESET_AUTO = 0,
     /*
-     Minutes on a 2-core CPU.
+     Takes minutes on a 2-core CPU.
      */
     SVK_PRESET_DRAFT = 1,
     /*
@@ -131,7 +138,7 @@ enum SvkPreset
      */
     SVK_PRESET_DEFAULT = 2,
     /*
-     The paper's schedule and constants.
+     Schedule and constants of the paper.
      */
     SVK_PRESET_PAPER = 3,
 };
@@ -144,7 +151,7 @@ typedef uint32_t SvkPreset;
 #endif // __cplusplus
 
 /*
- Spherical-harmonics degree of colours: above 0 they depend on the direction.
+ Degree of the spherical harmonics of colours; above 0 colours depend on the viewing direction.
  */
 enum SvkShDegree
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -152,23 +159,23 @@ enum SvkShDegree
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     What photos support that are left out for a test.
+     The highest degree that improves photos left out of the fit.
      */
     SVK_SH_DEGREE_AUTO = 0,
     /*
-     The same from everywhere.
+     The same colour from all directions.
      */
     SVK_SH_DEGREE_ZERO = 1,
     /*
-     4 numbers per colour channel.
+     4 coefficients per colour channel.
      */
     SVK_SH_DEGREE_ONE = 2,
     /*
-     9.
+     9 coefficients per colour channel.
      */
     SVK_SH_DEGREE_TWO = 3,
     /*
-     16.
+     16 coefficients per colour channel.
      */
     SVK_SH_DEGREE_THREE = 4,
 };
@@ -181,7 +188,7 @@ typedef uint32_t SvkShDegree;
 #endif // __cplusplus
 
 /*
- Whether the scene has what a text means.
+ Presence in the scene of the thing that a text means.
  */
 enum SvkPresence
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -189,20 +196,19 @@ enum SvkPresence
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     The text model knows too few texts to tell.
+     The text model has too few other texts to compare with.
      */
     SVK_PRESENCE_UNKNOWN = 0,
     /*
-     It has.
+     The thing is in the scene.
      */
     SVK_PRESENCE_FOUND = 1,
     /*
-     What the scene's features say does not decide, or the text is not wholly understood (see
-     svk_scene_notes).
+     The features do not decide, or a part of the text is not understood (see svk_scene_notes).
      */
     SVK_PRESENCE_UNSURE = 2,
     /*
-     It has not.
+     The thing is not in the scene.
      */
     SVK_PRESENCE_ABSENT = 3,
 };
@@ -215,7 +221,7 @@ typedef uint32_t SvkPresence;
 #endif // __cplusplus
 
 /*
- What a call of the progress callback is about.
+ Kind of a call of the progress callback.
  */
 enum SvkProgressKind
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -227,11 +233,11 @@ enum SvkProgressKind
      */
     SVK_PROGRESS_KIND_BEGIN = 0,
     /*
-     `done` of its `total` steps are finished.
+     `done` of the `total` steps of the stage are finished.
      */
     SVK_PROGRESS_KIND_STEP = 1,
     /*
-     It is over.
+     The stage ends.
      */
     SVK_PROGRESS_KIND_END = 2,
     /*
@@ -248,7 +254,7 @@ typedef uint32_t SvkProgressKind;
 #endif // __cplusplus
 
 /*
- What to render.
+ Rendered channel.
  */
 enum SvkChannel
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -256,8 +262,8 @@ enum SvkChannel
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     4 values: red, green, blue on black (display-referred sRGB values, not clamped in floats),
-     and alpha.
+     4 values: red, green and blue on black, as display-referred sRGB values (not clamped in
+     floats), and alpha.
      */
     SVK_CHANNEL_COLOUR = 0,
     /*
@@ -265,16 +271,15 @@ enum SvkChannel
      */
     SVK_CHANNEL_ALPHA = 1,
     /*
-     1 value: expected camera z in scene units, 0 where alpha is below a half.
+     1 value: expected camera z in scene units; 0 where alpha is below a half.
      */
     SVK_CHANNEL_DEPTH = 2,
     /*
-     The blended features of one level: as many values as SvkSceneInfo.feature_dim says for it.
+     Blended features of one level: SvkSceneInfo.feature_dim values.
      */
     SVK_CHANNEL_FEATURES = 3,
     /*
-     1 value: how well the pixel answers `text`, 0 to 1, smoothed; 0 where the scene says
-     nothing.
+     1 value: smoothed relevancy of the pixel to `text`, 0 to 1; 0 where the view is empty.
      */
     SVK_CHANNEL_RELEVANCY = 4,
 };
@@ -287,7 +292,7 @@ typedef uint32_t SvkChannel;
 #endif // __cplusplus
 
 /*
- How values are stored. Rows go from top to bottom, without gaps.
+ Memory layout of values. Rows go from top to bottom, without gaps.
  */
 enum SvkEncoding
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -300,16 +305,18 @@ enum SvkEncoding
      */
     SVK_ENCODING_F32 = 0,
     /*
-     32-bit floats [ceil(values / 4)][height][width][4], filled up with zeros. As an image:
-     VK_FORMAT_R32G32B32A32_SFLOAT with one array layer for every 4 values.
+     32-bit floats [ceil(values / 4)][height][width][4], padded with zeros. As an image:
+     VK_FORMAT_R32G32B32A32_SFLOAT with one array layer per 4 values.
      */
     SVK_ENCODING_F32X4 = 1,
     /*
-     The same in 16-bit floats: VK_FORMAT_R16G16B16A16_SFLOAT. Not for relevancy.
+     16-bit floats, otherwise as SVK_ENCODING_F32X4. As an image: VK_FORMAT_R16G16B16A16_SFLOAT.
+     Not for relevancy.
      */
     SVK_ENCODING_F16X4 = 2,
     /*
-     The same in 8 bits, values clamped to [0, 1]: VK_FORMAT_R8G8B8A8_UNORM. Not for relevancy.
+     8 bits, values clamped to [0, 1], otherwise as SVK_ENCODING_F32X4. As an image:
+     VK_FORMAT_R8G8B8A8_UNORM. Not for relevancy.
      */
     SVK_ENCODING_UNORM8_X4 = 3,
 };
@@ -330,8 +337,8 @@ enum SvkArray
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     [N][3] centres, scene units; axes as the cameras' (x right, y down, z forward in a camera
-     without rotation).
+     [N][3] centres in scene units; the axes are x right, y down, z forward of a camera without
+     rotation.
      */
     SVK_ARRAY_MEANS = 0,
     /*
@@ -352,8 +359,9 @@ enum SvkArray
      */
     SVK_ARRAY_SH = 4,
     /*
-     [N] pixels of all photos that show the Gaussian; below 0.05 no photo does and it is guessed.
-     Empty (0 floats) where that is not known: files of Gaussians, scenes of older versions.
+     [N] numbers of pixels, over all photos, that show the Gaussian. Below 0.05 no photo shows
+     it, and it is extrapolated. Empty (0 floats) where this is unknown: files of Gaussians,
+     scenes of older versions.
      */
     SVK_ARRAY_SEEN = 5,
 };
@@ -366,7 +374,7 @@ typedef uint32_t SvkArray;
 #endif // __cplusplus
 
 /*
- A Vulkan device and where the models are.
+ A Vulkan device and a folder of models.
  */
 typedef struct SvkContext SvkContext;
 
@@ -376,7 +384,7 @@ typedef struct SvkContext SvkContext;
 typedef struct SvkScene SvkScene;
 
 /*
- How a context is made. All zero (but for `size`) is the default.
+ Options of a context. Zero is the default of every field but `size`.
  */
 typedef struct {
     /*
@@ -384,8 +392,8 @@ typedef struct {
      */
     size_t size;
     /*
-     Part of a Vulkan device's name, or its number as a text; NULL = the best one. Not for
-     svk_context_adopt.
+     Part of the name of a Vulkan device, or its number as a text; NULL = the best device. Not
+     for svk_context_adopt.
      */
     const char *device;
     /*
@@ -393,15 +401,15 @@ typedef struct {
      */
     const char *models;
     /*
-     1 = training gives the same bits on every run on one device, about a tenth slower.
+     1 = training gives the same bits in every run on one device, about a tenth slower.
      */
     uint32_t deterministic;
     /*
-     1 = with the Khronos validation layer. Not for svk_context_adopt.
+     1 = enable the Khronos validation layer. Not for svk_context_adopt.
      */
     uint32_t validation;
     /*
-     What computes the networks, as --provider takes it; NULL = the environment variable
+     Provider that computes the networks, as of --provider; NULL = the environment variable
      SPLATVK_PROVIDER, or else "auto".
      */
     const char *provider;
@@ -413,13 +421,13 @@ typedef struct {
 typedef void (*SvkVoidFunction)(void);
 
 /*
- Takes or releases the host's own lock of a queue; `user` is the structure's.
+ Locks or unlocks a queue of the host; `user` is SvkVulkanDevice.user.
  */
 typedef void (*SvkQueueFunction)(void *user);
 
 /*
- A Vulkan device of the host, for svk_context_adopt. It must outlive the context and all scenes
- made from it.
+ A Vulkan device of the host, for svk_context_adopt. It must outlive the context and all its
+ scenes.
  */
 typedef struct {
     /*
@@ -427,7 +435,7 @@ typedef struct {
      */
     size_t size;
     /*
-     VkInstance made with apiVersion 1.2 or newer.
+     VkInstance, created with apiVersion 1.2 or newer.
      */
     void *instance;
     /*
@@ -435,15 +443,16 @@ typedef struct {
      */
     void *physical_device;
     /*
-     VkDevice made with the feature synchronization2 (of Vulkan 1.3 or VK_KHR_synchronization2).
+     VkDevice, created with the feature synchronization2 (of Vulkan 1.3 or
+     VK_KHR_synchronization2).
      */
     void *device;
     /*
-     VkQueue with compute.
+     VkQueue that supports compute.
      */
     void *queue;
     /*
-     Its family.
+     Queue family of `queue`.
      */
     uint32_t queue_family;
     /*
@@ -451,14 +460,14 @@ typedef struct {
      */
     uint32_t extension_count;
     /*
-     Names of the device extensions that were enabled.
+     Names of the enabled device extensions.
      */
     const char *const *extensions;
     /*
-     The VkPhysicalDeviceFeatures2 chain that the device was made with. Each feature of this list
-     that is on makes some work faster: shaderInt64, storageBuffer16BitAccess,
-     subgroupSizeControl, computeFullSubgroups, shaderBufferFloat32AtomicAdd. timelineSemaphore
-     is needed for SvkSync. Read during the call only.
+     VkPhysicalDeviceFeatures2 chain of the device's creation. Some work is faster with each of
+     these features: shaderInt64, storageBuffer16BitAccess, subgroupSizeControl,
+     computeFullSubgroups, shaderBufferFloat32AtomicAdd. SvkSync needs timelineSemaphore. Read
+     during the call only.
      */
     const void *features;
     /*
@@ -466,23 +475,22 @@ typedef struct {
      */
     SvkVoidFunction get_instance_proc_addr;
     /*
-     Called around every use of the queue. NULL = the host leaves the queue alone while a call
-     with this context or one of its scenes runs.
+     Called before every use of the queue. NULL = the host does not use the queue during calls
+     with this context or one of its scenes.
      */
     SvkQueueFunction lock_queue;
     /*
-     The end of `lock_queue`.
+     Called after every use of the queue; set if and only if `lock_queue` is.
      */
     SvkQueueFunction unlock_queue;
     /*
-     Given to both.
+     Argument of `lock_queue` and `unlock_queue`.
      */
     void *user;
 } SvkVulkanDevice;
 
 /*
- A pinhole camera. Axes: x right, y down, z forward. The centre of the first pixel is at (0.5,
- 0.5).
+ A pinhole camera. Axes: x right, y down, z forward. The first pixel's centre is (0.5, 0.5).
  */
 typedef struct {
     /*
@@ -490,11 +498,11 @@ typedef struct {
      */
     size_t size;
     /*
-     Pixels.
+     Width of the image, pixels.
      */
     uint32_t width;
     /*
-     Pixels.
+     Height of the image, pixels.
      */
     uint32_t height;
     /*
@@ -506,11 +514,11 @@ typedef struct {
      */
     double fy;
     /*
-     Principal point, pixels.
+     Principal point along x, pixels.
      */
     double cx;
     /*
-     Principal point, pixels.
+     Principal point along y, pixels.
      */
     double cy;
     /*
@@ -528,61 +536,60 @@ typedef struct {
      */
     size_t size;
     /*
-     File name for messages, masks and cameras; NULL = that of `path`, or "photo_00", "photo_01",
+     File name in messages, masks and cameras; NULL = that of `path`, or "photo_00", "photo_01",
      ...
      */
     const char *name;
     /*
-     Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF); with SvkTrainOptions.views a folder of them,
-     too.
+     Image file (JPEG, PNG, HEIC, AVIF, WebP, TIFF), or a folder of image files.
      */
     const char *path;
     /*
-     Such an image file in memory.
+     Content of an image file.
      */
     const uint8_t *encoded;
     /*
-     Its length in bytes.
+     Length of `encoded`, bytes.
      */
     size_t encoded_bytes;
     /*
-     Upright 8-bit sRGB pixels, 3 or 4 bytes each; a fourth byte is skipped.
+     Upright 8-bit sRGB pixels of 3 or 4 bytes; the fourth byte is ignored.
      */
     const uint8_t *pixels;
     /*
-     Bytes of a pixel: 3 or 4.
+     Bytes per pixel of `pixels`: 3 or 4.
      */
     uint32_t pixel_bytes;
     /*
-     Pixels.
+     Width of `pixels`.
      */
     uint32_t width;
     /*
-     Pixels.
+     Height of `pixels`.
      */
     uint32_t height;
     /*
-     From one row to the next, bytes; 0 = width * pixel_bytes.
+     Distance of the rows of `pixels`, bytes; 0 = width * pixel_bytes.
      */
     size_t row_bytes;
     /*
-     Focal length in these pixels, where it is known; 0 = unknown. For `pixels`; files tell it
-     themselves.
+     Focal length of `pixels`, in pixels; 0 = unknown. Image files state their own.
      */
     double focal;
     /*
-     The photo's camera, where it is known; for all photos or for none.
+     Camera of the photo; NULL = unknown. For all photos or for none.
      */
     const SvkCamera *camera;
     /*
-     For `pixels`: a byte for each, 0 where the pixel is not used (a person, a bonnet), rows
-     packed; NULL = all are used. Files have masks in a folder "masks" beside theirs.
+     One byte for each of `pixels`, without gaps between rows: 0 = the pixel is not used (a
+     person, a bonnet). NULL = all are used. Image files have masks in a folder "masks" beside
+     them.
      */
     const uint8_t *mask;
 } SvkPhoto;
 
 /*
- What the progress callback is told. Texts are valid during the call only.
+ Argument of the progress callback. Texts are valid during the call only.
  */
 typedef struct {
     /*
@@ -598,28 +605,28 @@ typedef struct {
      */
     const char *stage;
     /*
-     Steps finished.
+     Number of finished steps.
      */
     uint64_t done;
     /*
-     Steps in all; 0 = unknown.
+     Number of all steps; 0 = unknown.
      */
     uint64_t total;
     /*
-     A short live figure ("PSNR 28.1"), or the warning.
+     A short figure ("PSNR 28.1"), or the warning.
      */
     const char *note;
 } SvkProgress;
 
 /*
- Called from any thread, never by two at a time, and never after svk_train has returned. Anything
- but 0 asks it to stop. No exception may leave it, and it may not call into the context that
- trains.
+ Progress callback. It is called from any thread, but never from two at a time, and not after
+ svk_train returns. A result other than 0 stops the training. It must not throw an exception or
+ call functions with the context that trains.
  */
 typedef int32_t (*SvkProgressFunction)(void *user, const SvkProgress *progress);
 
 /*
- How a scene is trained. All zero (but for `size`) is the default: built-in models, preset by
+ Options of training. Zero is the default of every field but `size`: built-in models, preset by
  device.
  */
 typedef struct {
@@ -632,11 +639,12 @@ typedef struct {
      */
     uint32_t preset;
     /*
-     How many photos to use where a folder is given; 0 = all that are given.
+     Number of photos to choose of files and folders; 0 = all files, or at most 4 where a folder
+     is given.
      */
     uint32_t views;
     /*
-     Seed of everything random.
+     Seed of all random numbers.
      */
     uint64_t seed;
     /*
@@ -648,16 +656,16 @@ typedef struct {
      */
     uint64_t language_iterations;
     /*
-     Length of the codes that splats carry: 3, 8 or 16; 0 = 16.
+     Length of the codes of splats: 3, 8 or 16; 0 = 16.
      */
     uint32_t feature_dim;
     /*
-     1 = one model per level, as in the paper.
+     1 = one set of splats per level, as in the paper.
      */
     uint32_t per_level;
     /*
-     Known cameras: transforms.json, a COLMAP model folder or cameras.json; NULL = found from the
-     photos.
+     Known cameras: transforms.json, a COLMAP model folder or cameras.json; NULL = estimated from
+     the photos.
      */
     const char *cameras;
     /*
@@ -670,38 +678,38 @@ typedef struct {
      */
     const char *features;
     /*
-     Called with the progress; a result other than 0 stops the run; may be NULL.
+     Progress callback; may be NULL.
      */
     SvkProgressFunction progress;
     /*
-     Given to `progress`.
+     First argument of `progress`.
      */
     void *user;
     /*
-     Longer side of the working images, pixels: larger photos are scaled down, none is enlarged.
-     0 = 800 on a CPU device, 1600 on a GPU.
+     Longer side of the working images, pixels: larger photos are scaled down, smaller ones are
+     not enlarged. 0 = 800 on a CPU device, 1600 on a GPU.
      */
     uint64_t max_size;
     /*
-     Cameras and points, as `splatvk run --init` takes it: "sfm", "cameras:FILE", the name of an
-     installed network, or "auto" for the best of them. NULL = `cameras`, or else "sfm".
+     Source of cameras and points, as of `splatvk run --init`: "sfm", "cameras:FILE", the name of
+     an installed network, or "auto" for the best of them. NULL = `cameras`, or else "sfm".
      */
     const char *init;
     /*
-     Dense matches, as --matcher takes it. NULL = built-in.
+     Source of dense matches, as of --matcher. NULL = built-in.
      */
     const char *matcher;
     /*
-     Masks, as --masks takes it. NULL = `masks`, or else built-in.
+     Source of masks, as of --masks. NULL = `masks`, or else built-in.
      */
     const char *mask_source;
     /*
-     Region features, as --features takes it. NULL = `features`, or else built-in.
+     Source of region features, as of --features. NULL = `features`, or else built-in.
      */
     const char *feature_source;
     /*
-     How language gets onto the splats, as --method takes it. NULL = "lift"; "sparselgs" with the
-     preset of the paper, `language_iterations`, `per_level` or `compat`.
+     Method of the language stage, as of --method. NULL = "lift", or "sparselgs" with
+     SVK_PRESET_PAPER, `language_iterations`, `per_level` or `compat`.
      */
     const char *method;
     /*
@@ -709,19 +717,18 @@ typedef struct {
      */
     uint64_t sh_degree;
     /*
-     What can be done in several ways, as others do it: as --compat takes it. NULL = as this
-     library does it.
+     Implementation whose choices are reproduced, as of --compat. NULL = none.
      */
     const char *compat;
     /*
-     Depth suggested where photos cannot be matched, as --depth-prior takes it: "dir:FOLDER", the
-     name of an installed network, or "auto" for the best of them. NULL = none.
+     Source of depth where photos cannot be matched, as of --depth-prior: "dir:FOLDER", the name
+     of an installed network, or "auto" for the best of them. NULL = none.
      */
     const char *depth_prior;
 } SvkTrainOptions;
 
 /*
- What a scene holds.
+ Contents of a scene.
  */
 typedef struct {
     /*
@@ -733,29 +740,29 @@ typedef struct {
      */
     uint64_t splats;
     /*
-     Degree of their spherical harmonics, 0 to 3.
+     Degree of the spherical harmonics, 0 to 3.
      */
     uint32_t sh_degree;
     /*
-     Number of cameras; 0 for a bare file of Gaussians.
+     Number of cameras; 0 for a file of Gaussians.
      */
     uint32_t cameras;
     /*
-     Codes per level: subparts, parts, wholes. All 0 = no language.
+     Number of codes per level: subparts, parts, wholes. All 0 = no language.
      */
     uint32_t codes[3];
     /*
-     Feature values per level.
+     Length of the features per level.
      */
     uint32_t feature_dim[3];
     /*
-     Metres in a scene unit; 0 = unknown.
+     Metres per scene unit; 0 = unknown.
      */
     double metres_per_unit;
 } SvkSceneInfo;
 
 /*
- The answer to a text in one view.
+ Answer to a text in one view.
  */
 typedef struct {
     /*
@@ -763,50 +770,51 @@ typedef struct {
      */
     size_t size;
     /*
-     1 = the text was found in this view; 0 where it is absent.
+     1 = this view shows the thing that the text means.
      */
     uint32_t found;
     /*
-     Level that answers: 0 = subparts, 1 = parts, 2 = wholes.
+     Level of the answer: 0 = subparts, 1 = parts, 2 = wholes.
      */
     uint32_t level;
     /*
-     Best relevancy in the view, 0 to 1; 0.5 is as close as to an everyday phrase.
+     Best relevancy in the view, 0 to 1. At 0.5 a pixel is as similar to the text as to an
+     everyday phrase.
      */
     double score;
     /*
-     Centre of the most relevant pixel; the first pixel's is (0.5, 0.5).
+     Centre of the most relevant pixel along x; the first pixel's centre is 0.5.
      */
     double x;
     /*
-     See `x`.
+     Centre of the most relevant pixel along y; the first pixel's centre is 0.5.
      */
     double y;
     /*
-     Pixels in the mask; 0 where the text was not found.
+     Number of pixels of the mask; 0 where nothing was found.
      */
     uint64_t mask_pixels;
     /*
-     SvkPresence: whether the scene has it, whatever this view shows.
+     SvkPresence of the thing in the whole scene.
      */
     uint32_t presence;
     /*
-     Things in space that the text means: those of svk_scene_instances.
+     Number of things in space that the text means, as of svk_scene_instances.
      */
     uint32_t instances;
     /*
-     Share of other things that fit the scene at least as well: the p-value behind `presence`. 0
-     = unknown.
+     P-value of `presence`: share of texts, this one included, that fit the scene at least as
+     well. 0 = unknown.
      */
     double p_value;
     /*
-     How far the photos agree on what answers, 0 to 1; below 0 = unknown.
+     Agreement of the photos on the answer, 0 to 1; below 0 = unknown.
      */
     double reliability;
 } SvkAnswer;
 
 /*
- One of the things that a text means. Lengths are in scene units.
+ A thing in space that a text means. Lengths are in scene units.
  */
 typedef struct {
     /*
@@ -814,53 +822,53 @@ typedef struct {
      */
     size_t size;
     /*
-     Number of its Gaussians.
+     Number of Gaussians.
      */
     uint64_t splats;
     /*
-     Its share of all that answers the text, 0 to 1.
+     Share of the weight of all Gaussians that the text selects, 0 to 1.
      */
     double share;
     /*
-     How far the photos agree on what it is, 0 to 1; below 0 = unknown.
+     Agreement of the photos on the thing, 0 to 1; below 0 = unknown.
      */
     double reliability;
     /*
-     Middle of the oriented box.
+     Centre of the oriented bounding box.
      */
     double centre[3];
     /*
-     Lowest corner of the box along the scene's axes.
+     Lowest corner of the bounding box along the scene's axes.
      */
     double box_min[3];
     /*
-     Highest corner.
+     Highest corner of the bounding box along the scene's axes.
      */
     double box_max[3];
     /*
-     Unit vectors along the edges of the oriented box.
+     Unit vectors along the edges of the oriented bounding box, largest variance first.
      */
     double axes[3][3];
     /*
-     Lengths of its edges, longest first.
+     Lengths of the edges of the oriented bounding box along `axes`.
      */
     double box_size[3];
     /*
-     1 = the view shows it, at (`x`, `y`).
+     1 = the view shows the thing, at (`x`, `y`).
      */
     uint64_t seen;
     /*
-     Pixel of its middle in the view; the first pixel's centre is (0.5, 0.5).
+     Pixel of `centre` in the view along x; the first pixel's centre is 0.5.
      */
     double x;
     /*
-     See `x`.
+     Pixel of `centre` in the view along y; the first pixel's centre is 0.5.
      */
     double y;
 } SvkInstance;
 
 /*
- Where an image of the host is written: exactly one of `host`, `buffer` and `image` is set.
+ Destination of a rendered channel: exactly one of `host`, `buffer` and `image` is set.
  */
 typedef struct {
     /*
@@ -884,7 +892,7 @@ typedef struct {
      */
     uint32_t layers;
     /*
-     For relevancy: what to look for, UTF-8.
+     For relevancy: text of the query, UTF-8.
      */
     const char *text;
     /*
@@ -892,8 +900,7 @@ typedef struct {
      */
     void *host;
     /*
-     Size of `host`, or of the space in `buffer` from `offset` on. Must hold what the encoding
-     needs.
+     Size of `host`, or of `buffer` from `offset` on, bytes; at least the size of the encoding.
      */
     size_t bytes;
     /*
@@ -901,28 +908,28 @@ typedef struct {
      */
     uint64_t buffer;
     /*
-     First byte of `buffer`; a multiple of 4.
+     Offset in `buffer`, bytes; a multiple of 4.
      */
     uint64_t offset;
     /*
      VkImage with VK_IMAGE_USAGE_TRANSFER_DST_BIT, on the host's device: 2D, of the camera's
-     size, one sample, in the format that the encoding names. Mip level 0 is written.
+     size, one sample, in the format of the encoding. Mip level 0 is written.
      */
     uint64_t image;
     /*
-     VkImageLayout that the image has; VK_IMAGE_LAYOUT_UNDEFINED where its content may be lost.
+     VkImageLayout of the image before the write; VK_IMAGE_LAYOUT_UNDEFINED discards its content.
      */
     uint32_t old_layout;
     /*
-     VkImageLayout that it gets; not VK_IMAGE_LAYOUT_UNDEFINED.
+     VkImageLayout of the image after the write; not VK_IMAGE_LAYOUT_UNDEFINED.
      */
     uint32_t new_layout;
 } SvkOutput;
 
 /*
- Timeline semaphores of the host around writing to its buffers and images. Both belong to the
- context's queue family (or are shared concurrently) when the wait is over, and still do when the
- signal comes.
+ Timeline semaphores of the host for writes to its buffers and images. From the wait to the
+ signal these buffers and images must belong to the context's queue family or be shared
+ concurrently.
  */
 typedef struct {
     /*
@@ -930,21 +937,20 @@ typedef struct {
      */
     size_t size;
     /*
-     VkSemaphore of type timeline: targets may be written once it reaches `wait_value`; 0 = at
-     once.
+     VkSemaphore of type timeline: writes begin once it reaches `wait_value`; 0 = at once.
      */
     uint64_t wait_semaphore;
     /*
-     See `wait_semaphore`.
+     Value of `wait_semaphore`.
      */
     uint64_t wait_value;
     /*
-     VkSemaphore of type timeline: reaches `signal_value` when all targets are written. 0 = the
-     call waits for that.
+     VkSemaphore of type timeline: it reaches `signal_value` when all writes are finished; 0 =
+     the call waits for them.
      */
     uint64_t signal_semaphore;
     /*
-     See `signal_semaphore`.
+     Value of `signal_semaphore`.
      */
     uint64_t signal_value;
 } SvkSync;
@@ -954,46 +960,51 @@ extern "C" {
 #endif // __cplusplus
 
 /*
- The SVK_ABI_VERSION of the library. Thread-safe.
+ Returns the SVK_ABI_VERSION of the library. Thread-safe.
  */
 uint32_t svk_abi_version(void);
 
 /*
- The library's version, such as "0.1.0". Static memory. Thread-safe.
+ Returns the version of the library, such as "0.1.0", in static memory. Thread-safe.
  */
 const char *svk_version(void);
 
 /*
- Makes a context on a Vulkan device of its own. `options` may be NULL. On failure `*context` is NULL and the text is
- kept for the calling thread: svk_context_error(NULL, ...). Thread-safe.
+ Creates a context on a new Vulkan device. `options` may be NULL. On failure `*context` is NULL,
+ and svk_context_error(NULL, ...) returns the error text in the same thread. Thread-safe.
  */
 SvkStatus svk_context_create(const SvkContextOptions *options, SvkContext **context);
 
 /*
- Makes a context on the host's own Vulkan device. `options` may be NULL. Otherwise like svk_context_create.
+ Creates a context on a Vulkan device of the host. `options` may be NULL. Errors as of
+ svk_context_create. Thread-safe.
  */
 SvkStatus svk_context_adopt(const SvkVulkanDevice *device, const SvkContextOptions *options, SvkContext **context);
 
 /*
- Ends a context; scenes made from it stay usable. NULL is allowed. No other call with this context may be running.
+ Destroys a context; its scenes stay usable. NULL is allowed. No other call with this context may
+ be running.
  */
 void svk_context_destroy(SvkContext *context);
 
 /*
- Copies the name of the Vulkan device into `text` (`bytes` long, always ended) and returns the bytes that it needs.
- Thread-safe.
+ Copies the name of the Vulkan device into `text`, which has `bytes` bytes; it is truncated where
+ it does not fit and always ends with a zero byte. Returns the number of bytes that the whole
+ name needs. Thread-safe.
  */
 size_t svk_context_device_name(const SvkContext *context, char *text, size_t bytes);
 
 /*
- Copies the text of the last failed call with this context (in any thread) into `text` (`bytes` long, always ended) and
- returns the bytes that it needs. NULL = the last failed creation of a context in this thread. Thread-safe.
+ Copies the error text of the last failed call with this context, in any thread, into `text` as
+ svk_context_device_name does; returns the number of bytes that the whole text needs. With
+ `context` NULL: of the last failed creation of a context in this thread. Thread-safe.
  */
 size_t svk_context_error(const SvkContext *context, char *text, size_t bytes);
 
 /*
- Trains a scene from 2 to 16 photos. `options` may be NULL. On failure, and when the callback stops it, `*scene` is NULL
- and the text is the context's. Thread-safe; several trainings may run on one context, sharing its device.
+ Trains a scene from 2 to 16 photos. `options` may be NULL. On failure, and when the callback
+ stops it, `*scene` is NULL and the context keeps the error text. Thread-safe; several trainings
+ may run on one context and share its device.
  */
 SvkStatus svk_train(SvkContext *context,
                     const SvkPhoto *photos,
@@ -1002,44 +1013,46 @@ SvkStatus svk_train(SvkContext *context,
                     SvkScene **scene);
 
 /*
- Loads a scene directory, or a file of Gaussians (which has no language). On failure `*scene` is NULL and the text is the
- context's. Thread-safe.
+ Loads a scene directory, or a file of Gaussians, with the language file beside it if there is
+ one. On failure `*scene` is NULL and the context keeps the error text. Thread-safe.
  */
-SvkStatus svk_scene_load(SvkContext *context,
-                         const char *path,
-                         SvkScene **scene);
+SvkStatus svk_scene_load(SvkContext *context, const char *path, SvkScene **scene);
 
 /*
- Ends a scene, after waiting for what it still writes to buffers and images of the host. NULL is allowed. No other call
- with this scene may be running.
+ Destroys a scene, after its unfinished writes to buffers and images of the host. NULL is
+ allowed. No other call with this scene may be running.
  */
 void svk_scene_destroy(SvkScene *scene);
 
 /*
- Copies the text of the last failed call with this scene (in any thread) into `text` (`bytes` long, always ended) and
- returns the bytes that it needs. Thread-safe.
+ Copies the error text of the last failed call with this scene, in any thread, into `text` as
+ svk_context_device_name does; returns the number of bytes that the whole text needs.
+ Thread-safe.
  */
 size_t svk_scene_error(const SvkScene *scene, char *text, size_t bytes);
 
 /*
- What the scene holds. Thread-safe.
+ Fills `info` with the contents of the scene. Thread-safe.
  */
 SvkStatus svk_scene_info(const SvkScene *scene, SvkSceneInfo *info);
 
 /*
- Camera `index` of the scene, and the name of its photo in `name` (`name_bytes` long; may be NULL). Thread-safe.
+ Fills `camera` with camera `index` of the scene, and copies the name of its photo into `name`,
+ which has `name_bytes` bytes and may be NULL. Thread-safe.
  */
 SvkStatus svk_scene_camera(const SvkScene *scene, uint32_t index, SvkCamera *camera, char *name, size_t name_bytes);
 
 /*
- Copies an array of the scene (SvkArray) into `values`, which must hold exactly `count` floats. Thread-safe.
+ Copies an array of the scene into `values`. `array` is an SvkArray; `count` must be exactly the
+ number of its floats. Thread-safe.
  */
 SvkStatus svk_scene_read(const SvkScene *scene, uint32_t array, float *values, size_t count);
 
 /*
- Looks for a text in the view of a camera. `answer` is filled; `mask`, unless NULL, gets width × height bytes, 255 where
- the view shows what was asked for and 0 elsewhere, and `mask_bytes` is exactly that many. "Not found" is an answer, not
- a failure. Thread-safe; calls with one scene follow each other.
+ Looks for a text in the view of a camera and fills `answer`. `mask` may be NULL; otherwise it
+ receives width × height bytes, 255 where the view shows the thing and 0 elsewhere, and
+ `mask_bytes` must be exactly that number. "Not found" is an answer, not a failure. Thread-safe;
+ calls with one scene are serialised.
  */
 SvkStatus svk_scene_query(SvkScene *scene,
                           const char *text,
@@ -1049,9 +1062,10 @@ SvkStatus svk_scene_query(SvkScene *scene,
                           size_t mask_bytes);
 
 /*
- The things in space that a text means, largest first, with the pixels at which the view of a camera shows them. `instances`
- has room for `capacity` structures, each with its size set (0 and NULL to count only); `*count` gets the number of things,
- which may be more. Thread-safe; calls with one scene follow each other.
+ Fills `instances` with the things in space that a text means, largest first, and with their
+ pixels in the view of a camera. It has room for `capacity` structures, each with its size set;
+ NULL and 0 only count. `*count` receives the number of things, which may be larger. Thread-safe;
+ calls with one scene are serialised.
  */
 SvkStatus svk_scene_instances(SvkScene *scene,
                               const char *text,
@@ -1061,29 +1075,32 @@ SvkStatus svk_scene_instances(SvkScene *scene,
                               size_t *count);
 
 /*
- What is not understood of a text, one line each, into `notes` (`bytes` long, always ended): "answers for “mug”; “without
- handle” is not understood". Empty where all of it is understood. Thread-safe.
+ Copies notes on the parts of a text that are not understood into `notes`, which has `bytes`
+ bytes; one line each, truncated where they do not fit and always ended with a zero byte.
+ Example: "answers for “mug”; “without handle” is not understood". Empty if the whole text is
+ understood. Thread-safe.
  */
-SvkStatus svk_scene_notes(SvkScene *scene,
-                          const char *text,
-                          char *notes,
-                          size_t bytes);
+SvkStatus svk_scene_notes(SvkScene *scene, const char *text, char *notes, size_t bytes);
 
 /*
- Writes the scene: a file of Gaussians where the name ends like one (.ply, .compressed.ply, .splat, .spz; language goes
- beside it, into NAME.language.npz), a scene directory where it has no ending, ends in a slash or is that of a folder; any other
- ending is SVK_STATUS_INPUT. It appears whole or not at all; `replace` = 1 allows to replace a scene or file that is there, but
- never a symbolic link, what the scene was loaded from, a scene directory with files in it that splatvk did not write, or a place
- to which another process or thread writes. Thread-safe.
+ Writes the scene to `path`.
+
+ A path that ends in .ply, .compressed.ply, .splat, .spz, .glb or .gltf becomes a file of
+ Gaussians, with the language beside it in NAME.language.npz. A path without an ending, with a
+ final slash, or of a folder becomes a scene directory. Any other ending is SVK_STATUS_INPUT.
+
+ The output appears complete or not at all. With `replace` = 1 it may replace a scene or a file,
+ but never a symbolic link, the file or directory that the scene was loaded from, a scene
+ directory with files of other programs, or the output of a running process or thread.
+ Thread-safe.
  */
-SvkStatus svk_scene_save(SvkScene *scene,
-                         const char *path,
-                         uint32_t replace);
+SvkStatus svk_scene_save(SvkScene *scene, const char *path, uint32_t replace);
 
 /*
- Renders the scene from a camera into all `outputs` at once. `sync` may be NULL: then targets are written at once, and
- the call returns when they are. With a signal semaphore the call returns earlier; memory of the host is always written
- before it returns. Calls with one scene follow each other, and so do their writes. Thread-safe.
+ Renders the scene from a camera into all `outputs`. Without a signal semaphore, or with `sync`
+ NULL, the call returns when all outputs are written. With one it may return before buffers and
+ images are written; memory of the host is always written before it returns. Calls with one scene
+ are serialised, and so are their writes. Thread-safe.
  */
 SvkStatus svk_scene_render(SvkScene *scene,
                            const SvkCamera *camera,
@@ -1092,7 +1109,8 @@ SvkStatus svk_scene_render(SvkScene *scene,
                            const SvkSync *sync);
 
 /*
- Waits until everything that svk_scene_render was asked to write is written. Thread-safe.
+ Waits until all buffers and images of earlier calls of svk_scene_render are written.
+ Thread-safe.
  */
 SvkStatus svk_scene_wait(SvkScene *scene);
 

@@ -1,6 +1,6 @@
 //! The laboratory of splatvk: the tables of the paper's experiments ([`ablate`]), data with ground
-//! truth ([`generate`]), the published evaluation protocols ([`protocol`]), and their commands ([`cli`], program `splatlab`). It is not part of the
-//! installed program.
+//! truth ([`generate`]), the published evaluation protocols ([`protocol`]), and their commands
+//! ([`cli`], program `splatlab`). It is not part of the installed program.
 #![warn(missing_docs)]
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]

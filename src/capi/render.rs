@@ -230,7 +230,7 @@ fn image_target(
 ) -> Result<Target, CallError> {
     if encoding == Encoding::F32 && channels != 1 && channels != 4 {
         return bad_argument(format!(
-            "output {i}: no image format has {channels} values; take SVK_ENCODING_F32_X4"
+            "output {i}: no image format has {channels} values; take SVK_ENCODING_F32X4"
         ));
     }
     let layers = encoding.layers(channels) as u32;

@@ -36,7 +36,7 @@ pub struct Cli {
 #[derive(Debug, Subcommand)]
 pub enum Command {
     /// Photos → scene directory: cameras, splats, language, report
-    Run(RunArgs),
+    Run(Box<RunArgs>),
     /// Posed photos → scene without language
     Train(TrainArgs),
     /// Scene + cameras → images
