@@ -154,7 +154,7 @@ fn measure_scale_sets_metres() {
 }
 
 fn measure_json(scene: &Path, arguments: &[&str]) -> serde_json::Value {
-    let output = measure(&scene, &[&["--json"], arguments].concat()).output().unwrap();
+    let output = measure(scene, &[&["--json"], arguments].concat()).output().unwrap();
     assert!(output.status.success(), "{}", text(&output.stderr));
     serde_json::from_slice(&output.stdout).unwrap()
 }
