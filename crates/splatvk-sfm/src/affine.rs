@@ -131,7 +131,6 @@ mod tests {
     }
 
     #[test]
-
     #[ignore = "takes long: tools/test-long"]
     fn detect_matches_patch_at_70_degrees() {
         let image = texture(360, 300);

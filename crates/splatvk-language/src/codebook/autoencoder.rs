@@ -260,7 +260,6 @@ mod tests {
     }
 
     #[test]
-
     #[ignore = "takes long: tools/test-long"]
     fn lattice_covers_sphere_and_decodes() {
         let codes = lattice();

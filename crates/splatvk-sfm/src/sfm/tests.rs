@@ -148,7 +148,6 @@ fn reconstruct_two_photos_with_exif() {
 }
 
 #[test]
-
 #[ignore = "takes long: tools/test-long"]
 fn reconstruct_finds_only_real_distortion() {
     let truth = testing::train(&testing::folder());
@@ -192,7 +191,6 @@ fn agreement_low_only_for_wrong_view() {
 }
 
 #[test]
-
 #[ignore = "takes long: tools/test-long"]
 fn reconstruct_75_degrees_has_low_confidence() {
     let truth = testing::train(&testing::folder());
@@ -211,7 +209,6 @@ fn reconstruct_75_degrees_has_low_confidence() {
 }
 
 #[test]
-
 #[ignore = "takes long: tools/test-long"]
 fn affine_features_match_75_degrees() {
     let truth = testing::train(&testing::folder());
@@ -384,7 +381,6 @@ fn moved(photo: &Photo, shift: [i32; 2]) -> Photo {
 }
 
 #[test]
-
 #[ignore = "takes long: tools/test-long"]
 fn reconstruct_stabilised_lens_keeps_one_camera() {
     let truth = testing::train(&testing::folder());
@@ -417,7 +413,6 @@ fn equal_exif_shares_intrinsics() {
 }
 
 #[test]
-
 #[ignore = "takes long: tools/test-long"]
 fn fine_images_improve_cameras() {
     let mut truth = testing::train(&testing::folder());

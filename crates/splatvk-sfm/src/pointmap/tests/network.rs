@@ -118,7 +118,6 @@ fn view_with_wrong_pairs_left_out() {
 }
 
 #[test]
-
 #[ignore = "takes long: tools/test-long"]
 fn confidence_floor_selects_points() {
     let (case, _) = case();
