@@ -218,11 +218,10 @@ unsafe fn config(o: &SvkTrainOptions, networks: &Inventory) -> Result<Reconstruc
         },
         training: TrainingConfig {
             preset,
-            max_size: None,
             iterations: count(o.iterations),
             sh_degree,
             seed: o.seed,
-            deterministic: false,
+            ..TrainingConfig::default()
         },
         language: Some(LanguageConfig {
             matcher: source::<MatchSources>(text(o.matcher, "matcher")?, None)?,

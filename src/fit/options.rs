@@ -67,8 +67,9 @@ pub struct RgbOptions {
     pub losses: Losses,
     /// Least confidence of stereo depth that is used.
     pub min_confidence: f32,
-    /// Whether splats are kept behind the nearest depths of the photos and below a share of their
-    /// distance to the cameras in size; applied at the start, when pruning, and at the end.
+    /// Whether splats are clamped: in every photo behind the least depth of that photo, and no
+    /// larger than a share of their distance to the nearest camera. Applied at the start, when
+    /// pruning, and at the end.
     pub bounded: bool,
     /// Opacity below which splats are pruned.
     pub prune_opacity: f32,

@@ -22,7 +22,7 @@ pub(crate) struct Trainer {
     order: ViewOrder,
     /// One recorded step per view; `None` after a change of its buffers.
     programs: Vec<Option<Program>>,
-    /// Index of the model among those that a stage trains one after the other.
+    /// Number of the model: a stage with a model per level trains several in turn.
     group: usize,
 }
 
@@ -101,7 +101,7 @@ struct State<F> {
     model: model::State,
     cameras: Vec<Camera>,
     order: ViewOrder,
-    figures: F,
+    stage: F,
 }
 
 impl Trainer {
@@ -188,8 +188,8 @@ pub(super) fn train<T: Training>(
 fn save<T: Training>(run: &T, done: usize, progress: &dyn Progress) -> Result<()> {
     let Some(checkpoint) = progress.checkpoint() else { return Ok(()) };
     let Trainer { group, model, cameras, order, .. } = run.trainer();
-    let (model, figures) = (model.state()?, run.stage_state());
-    let state = State { group: *group, done, model, cameras: cameras.clone(), order: order.clone(), figures };
+    let (model, stage) = (model.state()?, run.stage_state());
+    let state = State { group: *group, done, model, cameras: cameras.clone(), order: order.clone(), stage };
     checkpoint.save(done, &state)
 }
 
@@ -200,7 +200,7 @@ fn restore<T: Training>(run: &mut T, progress: &dyn Progress) -> Result<usize> {
     let trainer = run.trainer_mut();
     trainer.model = Model::restored(&trainer.device, &kept.model)?;
     (trainer.cameras, trainer.order) = (kept.cameras, kept.order);
-    run.set_stage_state(kept.figures);
+    run.set_stage_state(kept.stage);
     progress.checkpoint().iter().for_each(|c| c.went_on_from(kept.done));
     Ok(kept.done)
 }

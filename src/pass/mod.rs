@@ -1,4 +1,4 @@
-//! One file per GPU pass, each with its CPU reference.
+//! GPU passes, one file each with its CPU reference; buffers, views and options that passes share.
 pub mod adam;
 pub mod bands;
 pub mod bin;

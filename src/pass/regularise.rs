@@ -4,8 +4,8 @@ use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Records the gradients by D = Σwz and A of `weight · Σ |D − A·d|/d` over pixels with reference
-/// depth d > 0; both become zero without a reference. For a mean, `weight` is divided by the number
-/// of pixels.
+/// depth d > 0. Overwrites both planes of gradients, with zeros without a reference. For a mean,
+/// `weight` is divided by the number of pixels.
 pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<&Buffer<f32>>, weight: f64) {
     rec.pass("regularisers");
     let pixels = frame.pixels();

@@ -29,7 +29,7 @@ const HOST_BASE: u64 = 300 << 20;
 const STEREO_VIEWS: u64 = MAX_SOURCES as u64 + 1;
 /// Share of a device's memory that buffers may fill: drivers keep some, and allocations leave gaps.
 const HEAP_SHARE: f64 = 0.9;
-/// Splats that continue the surfaces beyond one photo's border, at most (`fit::margin`).
+/// Splats that continue the surfaces beyond one photo's border, at most (`src/fit/unseen`).
 const MARGIN: usize = 15_000;
 
 /// Memory limits of a machine.

@@ -191,9 +191,20 @@ impl ReconstructionConfig {
             language.method = Some(language.method(preset));
             language.feature_dim = Some(language.feature_dim(preset));
             language.per_level = language.per_level();
-            language.check(preset)?;
         }
+        self.check()?;
         Ok(self)
+    }
+
+    /// Refuses values out of range, and settings that contradict each other.
+    ///
+    /// # Errors
+    /// A setting, with the values that can be given.
+    pub fn check(&self) -> Result<()> {
+        match &self.language {
+            Some(language) => language.check(self.training.preset),
+            None => Ok(()),
+        }
     }
 
     /// Every source that is chosen.

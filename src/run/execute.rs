@@ -110,6 +110,7 @@ impl Reconstruction<'_> {
     ) -> Result<RunOutcome> {
         let Reconstruction { config, queries, base, origin } = self;
         // Everything that can be refused is read before the long stages.
+        config.check()?;
         registry.compute().report(progress)?;
         let networks = Networks::find(config, registry)?;
         networks.warn_untrained(progress);

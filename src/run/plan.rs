@@ -180,7 +180,7 @@ impl ReconstructionConfig {
         ViewDependentOptions::preset(preset, degree, self.training.seed)
     }
 
-    /// The options as the method of the language takes them.
+    /// The options with the steps of the language method; some methods train no colours.
     fn trained_colours(&self, options: RgbOptions) -> RgbOptions {
         match &self.language {
             Some(language) => language.recipe(self.training.preset).rgb(options),

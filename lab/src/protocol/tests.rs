@@ -510,7 +510,7 @@ fn scannet_counts_labels_and_places_frames() {
 
 #[test]
 fn ground_truth_serves_lerf_and_ovs() {
-    let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/breakfast"));
+    let folder = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/data/breakfast"));
     let truth = GroundTruth::read(folder).unwrap();
     let scene: Vec<Camera> =
         truth.frames.iter().filter(|f| f.split == Split::Train).map(|f| f.camera.clone()).collect();
