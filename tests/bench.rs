@@ -146,6 +146,10 @@ fn refuses(args: &[&str], word: &str) {
 fn bench_refuses_unusable_arguments() {
     refuses(&["bench", "--features", "17"], "--features 17");
     refuses(&["bench", "--seconds", "0"], "--seconds 0");
+    refuses(&["bench", "models", "--json", "x.json"], "leave --json out");
+    refuses(&["bench", "cameras"], "--data");
+    refuses(&["bench", "cameras", "--data", "src"], "ground_truth.json");
+    refuses(&["bench", "cameras", "sort", "--data", "src"], "alone");
     refuses(&["bench", "--repeats", "0"], "--repeats 0");
     refuses(&["bench", "--splats", "0"], "--splats 0");
     refuses(&["bench", "--sweep", "10,0"], "--sweep 0");

@@ -175,6 +175,7 @@ fn field(images: &[RgbImage]) -> LanguageField {
 }
 
 #[test]
+#[ignore = "takes long: tools/test-long"]
 fn language_in_bands_matches_whole() {
     let (splats, _) = seeded::benchmark(3000, 640, 480, 0, 9);
     let whole = limited(128 * MIB, true);

@@ -6,11 +6,12 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Searched places, relative to the repository.
-const PLACES: [&str; 13] = [
+const PLACES: [&str; 14] = [
     "src",
     "crates",
     "examples",
     "glsl",
+    "lab",
     "tests",
     "tools",
     "docs",

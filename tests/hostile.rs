@@ -422,7 +422,10 @@ fn scene_contains_no_typed_folders() {
         );
     }
     let record = std::fs::read_to_string(path_of("alice-t/scene/run.json")).unwrap();
-    assert!(record.contains("\"images\": \"photos\""), "what it was made of: {record}");
+    assert!(
+        record.contains("\"photos\"") && record.contains("\"cameras:cameras.json\""),
+        "what it was made of: {record}"
+    );
     let mode = |path: &Path| path.metadata().unwrap().mode() & 0o777;
     let stages: Vec<_> = std::fs::read_dir(home.join("stages")).unwrap().map(|e| e.unwrap().path()).collect();
     assert!(mode(&home.join("stages")) == 0o700 && !stages.is_empty());

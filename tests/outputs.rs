@@ -100,7 +100,6 @@ fn outputs_replace_only_with_force() {
         assert_refused(&forced(command_line(words, &file)), "a file is in the way");
         assert_refused(&command_line(words, scene()), "--force");
     }
-    assert_refused(&forced(command_line("generate --out", &full)), "not empty and not generated data");
     assert_eq!(std::fs::read_to_string(&file).unwrap(), "precious");
     assert_eq!(std::fs::read_to_string(full.join("letter")).unwrap(), "precious");
     assert_eq!(
@@ -125,7 +124,6 @@ fn outputs_never_replace_links_or_devices() {
         }
         assert_refused(&forced(command_line(words, Path::new("/dev/null"))), "device");
     }
-    assert_refused(&command_line("generate --out", &path_of("to-folder")), "symbolic link");
     assert!(std::fs::symlink_metadata("/dev/null").unwrap().file_type().is_char_device());
     assert_eq!(std::fs::read_to_string(path_of("letter")).unwrap(), "precious");
     assert!(
@@ -161,30 +159,6 @@ fn force_replaces_only_same_names() {
         assert_eq!(std::fs::read_to_string(out.join("letter")).unwrap(), "precious");
         assert!(names(&out).iter().all(|n| !n.contains("partial")));
     }
-}
-
-#[test]
-fn force_replaces_only_pure_data_sets() {
-    let folder = tempfile::tempdir().unwrap();
-    let data = folder.path().join("data");
-    succeeds(&command_line(&generate_words(3), &data));
-    assert_refused(&command_line(&generate_words(2), &data), "--force");
-    let regions = format!("generate --from {} --out", data.display());
-    assert_refused(&forced(command_line(&regions, &data)), "is read, and lies in");
-    succeeds(&forced(command_line(&generate_words(2), &data)));
-    assert_eq!(names(&data.join("images")), ["train_00.jpg", "train_01.jpg"], "no photo of the older data");
-    let regions = format!("generate --from {} --out", data.display());
-    let out = folder.path().join("regions");
-    succeeds(&command_line(&regions, &out));
-    succeeds(&forced(command_line(&regions, &out)));
-    std::fs::write(data.join("letter"), "precious").unwrap();
-    assert_refused(&forced(command_line(&generate_words(2), &data)), "did not write: letter;");
-    assert_eq!(std::fs::read_to_string(data.join("letter")).unwrap(), "precious");
-    assert_eq!(names(folder.path()), ["data", "regions"]);
-}
-
-fn generate_words(views: u32) -> String {
-    format!("generate --seed 1000 --size 64x64 --views {views} --held-out 0 --out")
 }
 
 #[test]

@@ -19,6 +19,7 @@ fn path(p: &Path) -> &str {
 }
 
 #[test]
+#[ignore = "takes long: tools/test-long"]
 fn ablate_measures_generated_scene() {
     let folder = tempfile::tempdir().unwrap();
     let (data, out) = (folder.path().join("data"), folder.path().join("tables"));
@@ -180,4 +181,48 @@ fn output_folder_has_one_writer() {
         assert_eq!(first.wait().unwrap().code(), Some(130));
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "{words:?}");
     }
+}
+
+fn assert_refused(args: &[&str], says: &str) {
+    let output = splatlab(args);
+    let text = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(2) && text.contains(says), "{args:?}: {text}");
+}
+
+/// Generated data replaces generated data only.
+#[cfg(unix)]
+#[test]
+fn force_replaces_only_pure_data_sets() {
+    let folder = tempfile::tempdir().unwrap();
+    let path_of = |name: &str| folder.path().join(name);
+    let names = |folder: &Path| {
+        let entries =
+            std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap());
+        std::collections::BTreeSet::from_iter(entries)
+    };
+    let (data, regions) = (path_of("data"), path_of("regions"));
+    let generate = |views: &'static str, force: &'static [&'static str]| {
+        let small = ["--views", views, "--held-out", "0", "--size", "96x72", "--objects", "2"];
+        [&["generate", "--out", path(&data)], &small[..], force].concat()
+    };
+    let succeeds = |args: &[&str]| assert!(splatlab(args).status.success(), "{args:?}");
+    succeeds(&generate("3", &[]));
+    assert_refused(&generate("2", &[]), "--force");
+    let from = ["generate", "--from", path(&data), "--out"];
+    assert_refused(&[&from[..], &[path(&data), "--force"]].concat(), "is read, and lies in");
+    succeeds(&generate("2", &["--force"]));
+    assert_eq!(names(&data.join("images")).len(), 2, "no photo of the older data");
+    succeeds(&[&from[..], &[path(&regions)]].concat());
+    succeeds(&[&from[..], &[path(&regions), "--force"]].concat());
+    std::fs::write(data.join("letter"), "precious").unwrap();
+    assert_refused(&generate("2", &["--force"]), "did not write: letter;");
+    assert_eq!(std::fs::read_to_string(data.join("letter")).unwrap(), "precious");
+    std::fs::create_dir(path_of("full")).unwrap();
+    std::fs::write(path_of("full/letter"), "precious").unwrap();
+    let full = path_of("full");
+    assert_refused(&["generate", "--out", path(&full), "--force"], "not empty and not generated data");
+    let link = path_of("link");
+    std::os::unix::fs::symlink(&full, &link).unwrap();
+    assert_refused(&["generate", "--out", path(&link)], "symbolic link");
+    assert_eq!(Vec::from_iter(names(folder.path())), ["data", "full", "link", "regions"]);
 }

@@ -190,6 +190,7 @@ mod tests {
     use std::path::Path;
 
     #[test]
+    #[ignore = "takes long: tools/test-long"]
     fn masks_of_breakfast_reach_targets() {
         let registry = Registry::open(None).unwrap();
         let breakfast = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/breakfast");

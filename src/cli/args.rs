@@ -247,6 +247,9 @@ pub struct EvalArgs {
     /// Write over what is there: ordinary files of the same names
     #[arg(long)]
     pub force: bool,
+    /// For the published protocols, in splatlab
+    #[arg(long, value_name = "FILE", hide = true)]
+    pub cameras: Option<PathBuf>,
     /// `field`; the published protocols are in splatlab
     #[arg(long, value_name = "NAME", hide = true)]
     pub protocol: Option<String>,

@@ -36,6 +36,11 @@ pub fn bench(args: &BenchArgs) -> Result<()> {
         return masks(args);
     }
     if has(BenchPart::Models) {
+        if args.parts == [BenchPart::Models] && args.json.is_some() {
+            return Err(Error::input(
+                "--json: bench models prints a table and writes no report; leave --json out",
+            ));
+        }
         models(&args.registry()?.uncached())?;
         if args.parts == [BenchPart::Models] {
             return Ok(());

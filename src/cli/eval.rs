@@ -1,5 +1,5 @@
 //! `splatvk eval`
-use super::args::EvalArgs;
+use super::args::{DeviceArgs, EvalArgs};
 use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::{moved, progress, scene};
@@ -7,7 +7,6 @@ use crate::eval::{EvalReport, Evaluation, GroundTruth};
 use crate::format::scene_dir::Scene;
 use crate::format::write_json;
 use crate::gpu;
-use crate::infer::Registry;
 use crate::query::TextQuery;
 use crate::run::Compat;
 use crate::run::ask;
@@ -22,6 +21,9 @@ pub(super) fn eval(args: &EvalArgs) -> Result<()> {
     if let Some(protocol) = args.protocol.as_deref().filter(|name| *name != "field") {
         return Err(moved(&format!("eval --protocol {protocol}")));
     }
+    if args.cameras.is_some() {
+        return Err(Error::input("--cameras: ground_truth.json has the cameras; leave it out"));
+    }
     let inputs: [&Path; 2] = [&args.scene, &args.ground_truth];
     let open = |out| WrittenFiles::open(out, args.force, &inputs);
     let out = args.out.as_deref().map(open).transpose()?;
@@ -31,11 +33,11 @@ pub(super) fn eval(args: &EvalArgs) -> Result<()> {
 }
 
 /// Queries of the texts in the scene's space; none for a scene without language.
-pub fn embed(scene: &Scene, texts: &[String], registry: Registry) -> Result<Vec<TextQuery>> {
+pub fn embed(scene: &Scene, texts: &[String], device: &DeviceArgs) -> Result<Vec<TextQuery>> {
     if scene.language.is_none() || texts.is_empty() {
         return Ok(Vec::new());
     }
-    let mut encoder = encoder::of_scene(scene, registry)?;
+    let mut encoder = encoder::of_scene(scene, device.registry()?)?;
     let queries = ask::embedded(texts, encoder.as_mut())?;
     encoder.embedding_warning().iter().for_each(|warning| progress::reporter().warn(warning));
     Ok(queries)
@@ -49,7 +51,7 @@ fn score_scene(scene: &Scene, args: &EvalArgs, out: Option<&WrittenFiles>) -> Re
     let mut evaluation = Evaluation::new(truth, &scene.cameras, out.map(WrittenFiles::folder))?;
     evaluation.add_world(&scene.world);
     let phrases: Vec<String> = evaluation.phrases().into_iter().map(|p| p.1).collect();
-    let queries = embed(scene, &phrases, args.device.registry()?)?;
+    let queries = embed(scene, &phrases, &args.device)?;
     let device = gpu::open(args.device.device.as_deref())?;
     let no_language = LanguageField::default();
     let field = scene.language.as_ref().unwrap_or(&no_language);

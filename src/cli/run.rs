@@ -85,9 +85,11 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
             let made = base::record_of(scene)?;
             // The scene's queries, then the new ones.
             queries = made.config.plan.inputs.queries.clone();
-            queries.extend(
-                args.queries.iter().filter(|q| !made.config.plan.inputs.queries.contains(q)).cloned(),
-            );
+            for query in &args.queries {
+                if !queries.contains(query) {
+                    queries.push(query.clone());
+                }
+            }
             as_made(asked, &made, installed)?
         }
     };
@@ -144,7 +146,7 @@ fn source_as_made<K: SourceKind>(
     made: SourceChoice,
     installed: &Inventory,
 ) -> Result<SourceChoice> {
-    if asked.name != "auto" {
+    if asked != SourceChoice::named("auto") {
         return Ok(asked);
     }
     // The scene may have been moved here from another machine.

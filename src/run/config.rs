@@ -179,7 +179,7 @@ impl ReconstructionConfig {
         resolve::<GeometrySources>(init, installed)?;
         // A geometry network gives depth itself.
         let by_stereo = GeometrySources::SOURCES.iter().any(|s| s.name == init.name);
-        if depth_prior.name == AUTO && !by_stereo {
+        if *depth_prior == SourceChoice::named(AUTO) && !by_stereo {
             *depth_prior = sources::default::<DepthSources>();
         }
         resolve::<DepthSources>(depth_prior, installed)?;

@@ -34,6 +34,9 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let read: Vec<&Path> = plan.read().collect();
     let workspace = Workspace::create(&plan.output.out, plan.output.force, &read)?;
     let known = photos::camera_file(plan).map(cameras::read_file).transpose()?;
+    if known.is_none() && plan.inputs.points.is_some() {
+        return Err(Error::input("points are in the frame of given cameras; give --init cameras:FILE"));
+    }
     let cloud = plan.inputs.points.as_deref().map(|file| points::read(file, progress)).transpose()?;
     // The device comes first: it limits the size of the photos.
     let device = plan.machine.open(plan.config.training.deterministic)?;
@@ -46,10 +49,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
         (Some(known), Some(cloud)) => {
             Some(CameraOrigin::GivenGeometry(points::geometry(&mut photos, &known, cloud, progress)?))
         }
-        (None, Some(_)) => {
-            return Err(Error::input("points are in the frame of given cameras; give --init cameras:FILE"));
-        }
-        (known, None) => known.map(CameraOrigin::Known),
+        (known, _) => known.map(CameraOrigin::Known),
     };
     let store = store(plan.output.resume, plan.output.checkpoint_seconds)?;
     let queries = &plan.inputs.queries;
@@ -111,10 +111,17 @@ impl Reconstruction<'_> {
         let Reconstruction { config, queries, base, origin } = self;
         // Everything that can be refused is read before the long stages.
         config.check()?;
-        registry.compute().report(progress)?;
+        // Given cameras and points need no network.
+        let given = matches!(origin, Some(CameraOrigin::GivenGeometry(_)));
+        let needs_networks = config.language.is_some() || !given;
+        if needs_networks {
+            registry.compute().report(progress)?;
+        }
         let networks = Networks::find(config, registry)?;
         networks.warn_untrained(progress);
-        graph::check(config, &photos, registry)?;
+        if needs_networks {
+            graph::check(config, &photos, registry)?;
+        }
         let preset = config.preset_on(device);
         let mut plan =
             ScenePlan { build: GraphBuilder::new(config, preset, registry), config, queries, device };
@@ -123,7 +130,9 @@ impl Reconstruction<'_> {
             None => plan.scene(photos, origin)?,
         };
         let mut made = plan.build.graph.run(&scene.targets(), device, registry, store, progress)?;
-        registry.compute().report(progress)?;
+        if needs_networks {
+            registry.compute().report(progress)?;
+        }
         let trained = made.take(scene.trained)?;
         let PlacedPhotos { photos, left_out, .. } = made.take(scene.placed)?;
         let (splats, frames, language) = match scene.language {
@@ -170,7 +179,7 @@ impl Reconstruction<'_> {
             frames,
             language,
             provider: registry.compute().name().ok(),
-            models: registry.status(),
+            models: if config.language.is_some() { registry.status() } else { Vec::new() },
             networks: networks.used()?,
             stages: progress.stages(),
             seconds: progress.seconds(),

@@ -18,21 +18,33 @@ pub(super) fn load(
     max_size: usize,
     progress: &dyn Progress,
 ) -> Result<(Vec<Photo>, Option<Choice>)> {
-    let mut files = match known {
-        Some(known) => with_cameras(plan, known, progress)?,
+    let posed = known.map(|known| with_cameras(plan, known, progress)).transpose()?.flatten();
+    let has_cameras = posed.is_some();
+    let mut files = match posed {
+        Some(files) => files,
         None => photo::gather(&plan.inputs.photos, progress)?,
     };
+    if has_cameras {
+        photo::assign_masks(&mut files, &masks(plan)?, progress)?;
+    }
     // Without language a photo costs little memory.
     let most = plan.config.language.is_none().then(|| files.len().min(photo::MAX_VIEWS));
     let wanted = photo::photo_count(files.len(), plan.inputs.views.or(most))?;
     let mut choice = None;
     if wanted < files.len() {
         let (chosen, made) = choose::choose(&files, wanted, progress)?;
-        progress.inform(&made.message());
+        // A set of posed photos has more than the scene, which the record must state.
+        if has_cameras {
+            progress.warn(&made.message())
+        } else {
+            progress.inform(&made.message())
+        }
         files = chosen.into_iter().map(|i| files[i].clone()).collect();
         choice = Some(made);
     }
-    photo::assign_masks(&mut files, &masks(plan)?, progress)?;
+    if !has_cameras {
+        photo::assign_masks(&mut files, &masks(plan)?, progress)?;
+    }
     plan.config.check_budget(device, &photo::sizes_of(&files), max_size)?;
     Ok((photo::load_each(&files, max_size, progress)?, choice))
 }
@@ -89,19 +101,20 @@ fn masks(plan: &RunPlan) -> Result<MaskChoice> {
 }
 
 /// Photos with a camera in the input folder and in the folders below it that names of cameras
-/// contain.
-fn with_cameras(plan: &RunPlan, known: &CameraFile, progress: &dyn Progress) -> Result<Vec<Candidate>> {
+/// contain; `None` for videos, whose frames get names when they are read.
+fn with_cameras(
+    plan: &RunPlan,
+    known: &CameraFile,
+    progress: &dyn Progress,
+) -> Result<Option<Vec<Candidate>>> {
     let inputs = &plan.inputs.photos;
     let names: Vec<&str> = known.cameras.iter().map(|c| c.camera.name.as_str()).collect();
     let found = match inputs.as_slice() {
         [folder] if folder.is_dir() => photo::find_named(folder, &names)?,
         several => photo::find(several)?,
     };
-    if let Some(video) = found.videos.first() {
-        return Err(Error::input(format!(
-            "{}: a video, whose frames have no cameras in a file; give photos",
-            video.display()
-        )));
+    if !found.videos.is_empty() {
+        return Ok(None);
     }
     found.warnings().iter().for_each(|w| progress.warn(w));
     let paths: Vec<String> = found.photos.iter().map(|p| p.to_string_lossy().into_owned()).collect();
@@ -132,7 +145,7 @@ fn with_cameras(plan: &RunPlan, known: &CameraFile, progress: &dyn Progress) -> 
     let paths: Vec<String> = with.iter().map(|(p, _)| p.to_string_lossy().into_owned()).collect();
     let stems = photo::stems_apart(&paths);
     let files = with.iter().zip(&stems).map(|((path, _), stem)| Candidate::named(path, stem));
-    Ok(files.collect())
+    Ok(Some(files.collect()))
 }
 
 /// A path relative to its input folder.

@@ -26,7 +26,7 @@ static HEAP: Heap = Heap::new();
 static ONE: Mutex<()> = Mutex::new(());
 
 /// Default duration, seconds, all readers together.
-const SECONDS: u64 = 60;
+const SECONDS: u64 = 20;
 
 /// Number of findings after which the next reader runs.
 const MOST_FINDINGS: usize = 5;

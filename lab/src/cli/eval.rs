@@ -37,7 +37,7 @@ fn published(
     };
     let known = args.cameras.as_deref().map(views::read).transpose()?.unwrap_or_default();
     let mut protocol = protocol::open(kind, &args.ground_truth, &scene.cameras, &known)?;
-    let queries = embed(scene, &protocol.prompts(), args.device.registry()?)?;
+    let queries = embed(scene, &protocol.prompts(), &args.device)?;
     let scores = CodeScores::new(field, &queries)?;
     let device = gpu::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;

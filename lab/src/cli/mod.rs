@@ -39,3 +39,17 @@ impl Program for Lab {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn command_definitions_are_consistent() {
+        Lab::command().debug_assert();
+        let text =
+            Lab::command().try_get_matches_from(["splatlab", "generate", "--out", "x", "--texture", "much"]);
+        assert!(text.unwrap_err().to_string().contains("--texture"));
+    }
+}

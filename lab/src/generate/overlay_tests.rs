@@ -48,6 +48,7 @@ fn mark_finds_watermark_in_two_photos() {
 }
 
 #[test]
+#[ignore = "takes long: tools/test-long"]
 fn marked_watermark_keeps_poses_accurate() {
     let views = train_views();
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera.clone()).collect();

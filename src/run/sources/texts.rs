@@ -27,7 +27,7 @@ fn cosine(a: &[f32], b: &[f32]) -> f64 {
 }
 
 /// Text encoder for the features of a `dir:` folder with the table `path`, if it exists; `dim` is
-/// the length of the features, if table_rows.
+/// the length of the features, if known.
 pub fn dir_encoder(path: &Path, dim: Option<usize>, registry: &Registry) -> Result<Box<dyn RegionEncoder>> {
     let mut texts = TextEmbeddings::default();
     match dim {
@@ -187,7 +187,7 @@ mod tests {
             let row = NpyArray::f32(&[3], row);
             write_npz(folder.path().join("text_embeddings.npz"), &[("Blue", &row)]).unwrap();
         };
-        // Without a table only the length is table_rows.
+        // Without a table only the length is known.
         let mut towers = encoder(folder.path(), Some(3));
         let blue = towers.embed_texts(&["blue"]).unwrap();
         assert_eq!(towers.embedding_source("blue").as_deref(), Some("clip_toy"));

@@ -122,7 +122,7 @@ fn image_folder(photo: &Path) -> Option<(&Path, &Path)> {
 const DEEPEST: usize = 3;
 
 /// Mask folder of a photo: `masks` beside `images`, `masks_2` beside `images_2`. Beside the ground
-/// truth of `splatvk generate` it contains labels, and is ignored.
+/// truth of `splatlab generate` it contains labels, and is ignored.
 fn folder_beside(photo: &Path) -> Option<PathBuf> {
     let (images, _) = image_folder(photo)?;
     let name = images.file_name()?.to_str()?;

@@ -43,6 +43,7 @@ fn reconstruct_breakfast_from_corners() {
 }
 
 #[test]
+#[ignore = "takes long: tools/test-long"]
 fn reconstruct_breakfast_from_learned_features() {
     check("corners + XFeat", learned, 0.03, 0.0005, 0.002);
 }
