@@ -44,7 +44,7 @@ pub fn stopped() -> bool {
 }
 
 /// Prints the error that ends the process; of two threads that end it the first wins. Unusable
-/// input (exit code 2) drops the lines held in the first [`HELD_FOR`]: they concern work without a
+/// input (exit code 2) drops the lines held in the first `HELD_FOR`: they concern work without a
 /// result.
 pub fn print_error(message: &str, exit_code: u8) {
     static PRINTED: AtomicBool = AtomicBool::new(false);
@@ -165,7 +165,7 @@ impl Progress for JsonLines {
 const GRACE: Duration = Duration::from_millis(1000);
 
 /// Makes Ctrl-C, a termination signal and a closed terminal request a clean stop. A second one, or
-/// [`GRACE`], ends the process at once; unfinished files are removed in either case.
+/// `GRACE`, ends the process at once; unfinished files are removed in either case.
 pub fn stop_on_signal() {
     let outcome = ctrlc::set_handler(|| {
         if STOPPED.swap(true, Ordering::SeqCst) {

@@ -1,7 +1,7 @@
 //! The configuration of a reconstruction: every setting that changes its result, with its default.
 //!
 //! The command line flattens these structures into its options, the C structure maps to them once,
-//! and `run.json` stores them. Photos, files and machine are apart from it ([`super::plan`]).
+//! and `run.json` stores them. Photos, files and machine are apart from it (`run::plan`).
 use super::compat::{self, Compat};
 use super::method::{Method, Recipe};
 use super::sources::{

@@ -30,7 +30,7 @@ const BELOW: [&str; 12] = [
     "undistorted/sparse",
 ];
 
-/// Folder of the model of a data set: the first of [`BELOW`] that [`is_model`].
+/// Folder of the model of a data set: the first of `BELOW` that [`is_model`].
 pub fn find(folder: &Path) -> Option<PathBuf> {
     BELOW.iter().map(|below| folder.join(below)).find(|f| is_model(f))
 }
