@@ -1,7 +1,5 @@
 //! Command-line arguments.
-use crate::infer::provider;
 use crate::run::TrainingConfig;
-use clap::builder::PossibleValuesParser;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -14,7 +12,7 @@ pub use super::run::RunArgs;
 pub use crate::run::config::whole;
 pub use crate::run::config::{EXPERTS, compat_names as compats};
 pub use bench::{BenchArgs, BenchPart};
-pub use shared::{DeviceArgs, LogFormat, MACHINE, SavingArgs};
+pub use shared::{DeviceArgs, GlobalArgs, LogFormat, MACHINE, SavingArgs};
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
@@ -23,13 +21,9 @@ pub struct Cli {
     /// What to do.
     #[command(subcommand)]
     pub command: Command,
-    /// Progress and messages on standard error: for people, or one JSON object per line
-    #[arg(long, global = true, value_enum, default_value = "text", value_name = "FORMAT")]
-    pub log: LogFormat,
-    /// What computes the networks, as far as the ONNX Runtime library can; auto: a GPU that
-    /// answers, or else the CPU
-    #[arg(long, global = true, value_parser = PossibleValuesParser::new(provider::NAMES), value_name = "NAME", help_heading = MACHINE)]
-    pub provider: Option<String>,
+    /// Options of every command
+    #[command(flatten)]
+    pub global: GlobalArgs,
 }
 
 /// One variant per command; each has its own file in `cli/`.

@@ -87,12 +87,12 @@ impl Program for Cli {
     ];
 
     fn log(&self) -> LogFormat {
-        self.log
+        self.global.log
     }
 
     fn execute(mut self) -> Result<()> {
         if let Some(provider) = self.command.provider() {
-            *provider = self.provider;
+            *provider = self.global.provider;
         }
         match self.command {
             Command::Run(args) => run::run(&args),

@@ -10,9 +10,9 @@ use super::runtime::Input;
 use super::sam::{BATCH, MASKS, Sam};
 use super::{RegionEncoder, depth_prior, pairs, warp};
 use crate::format::npy::{self, NpyData};
-use crate::photo::{Photo, PlainBorder};
+use crate::photo::{self, Photo};
 use crate::progress::{Silent, peak_memory, reset_peak_memory};
-use crate::scene::{Affine, Image, RgbImage};
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 
 /// Largest difference to the reference, relative to its largest value: the effect of another order
@@ -191,26 +191,7 @@ fn picture(k: usize) -> Photo {
         if inside { texture(near, y, 3.0) } else { texture(x + 20.0 * k as f64, y, 1.0) }
     };
     let image = RgbImage { width, height, data: (0..width * height).map(pixel).collect() };
-    Photo {
-        path: format!("built-in {k}").into(),
-        stem: format!("built-in {k}"),
-        original_size: (width as u32, height as u32),
-        to_working: Affine::IDENTITY,
-        border: PlainBorder::default(),
-        exif_focal: None,
-        fine: None,
-        lost_pixels: 0,
-        coverage: None,
-        overlay: None,
-        masked: false,
-        notes: Vec::new(),
-        straightened: None,
-        turn: Default::default(),
-        camera_model: None,
-        gravity: None,
-        light: crate::photo::Light::NONE,
-        image,
-    }
+    photo::of_image(format!("built-in {k}").as_ref(), image)
 }
 
 /// Smooth pseudo-random colour.

@@ -1,7 +1,7 @@
 //! Toy networks with the interfaces of real ones, and a photo for them.
 use crate::onnx::{Attribute, FLOAT, INT64, Onnx};
-use splatvk_io::photo::{Photo, PlainBorder};
-use splatvk_types::scene::{Affine, RgbImage};
+use splatvk_io::photo::{self, Photo};
+use splatvk_types::scene::RgbImage;
 use std::path::Path;
 
 /// Mean colour of the image as embedding.
@@ -50,24 +50,5 @@ pub fn clip_in(folder: &Path, order: [usize; 3]) {
 }
 
 pub fn photo(stem: &str, image: RgbImage) -> Photo {
-    Photo {
-        path: format!("{stem}.png").into(),
-        stem: stem.into(),
-        original_size: (image.width as u32, image.height as u32),
-        to_working: Affine::IDENTITY,
-        border: PlainBorder::default(),
-        exif_focal: None,
-        fine: None,
-        lost_pixels: 0,
-        coverage: None,
-        overlay: None,
-        masked: false,
-        notes: Vec::new(),
-        straightened: None,
-        turn: Default::default(),
-        camera_model: None,
-        gravity: None,
-        light: splatvk_io::photo::Light::NONE,
-        image,
-    }
+    photo::of_image(format!("{stem}.png").as_ref(), image)
 }

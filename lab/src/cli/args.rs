@@ -4,8 +4,7 @@ use crate::generate::{Flat, Spoil};
 use crate::protocol::ProtocolKind;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use splatvk::cli::args::{DeviceArgs, LogFormat, MACHINE, whole};
-use splatvk::infer::provider;
+use splatvk::cli::args::{DeviceArgs, GlobalArgs, whole};
 use std::path::PathBuf;
 
 /// Tables of the paper's experiments, and data with ground truth
@@ -15,13 +14,9 @@ pub struct Lab {
     /// What to do.
     #[command(subcommand)]
     pub command: Command,
-    /// Progress and messages on standard error: for people, or one JSON object per line
-    #[arg(long, global = true, value_enum, default_value = "text", value_name = "FORMAT")]
-    pub log: LogFormat,
-    /// What computes the networks, as far as the ONNX Runtime library can; auto: a GPU that
-    /// answers, or else the CPU
-    #[arg(long, global = true, value_parser = PossibleValuesParser::new(provider::NAMES), value_name = "NAME", help_heading = MACHINE)]
-    pub provider: Option<String>,
+    /// Options of every command
+    #[command(flatten)]
+    pub global: GlobalArgs,
 }
 
 /// One variant per command; each has its own file beside this one.

@@ -22,18 +22,18 @@ impl Program for Lab {
     const UNUSED: &'static [(&'static str, &'static [&'static str])] = &[("generate", &["provider", "log"])];
 
     fn log(&self) -> LogFormat {
-        self.log
+        self.global.log
     }
 
     fn execute(self) -> Result<()> {
         match self.command {
             Command::Ablate(mut args) => {
-                args.device.provider = self.provider;
+                args.device.provider = self.global.provider;
                 ablate::ablate(&args)
             }
             Command::Generate(args) => generate::generate(&args),
             Command::Eval(mut args) => {
-                args.device.provider = self.provider;
+                args.device.provider = self.global.provider;
                 eval::eval(&args)
             }
         }

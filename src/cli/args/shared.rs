@@ -1,8 +1,9 @@
 //! Options of several commands.
 use crate::Result;
-use crate::infer::Registry;
+use crate::infer::{Registry, provider};
 use crate::run::config::{EXPERTS, whole};
 use crate::run::{CHECKPOINT_SECONDS, Destination, Machine};
+use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueEnum};
 use std::path::PathBuf;
 
@@ -17,6 +18,18 @@ pub enum LogFormat {
 
 /// Heading of the options about the machine.
 pub const MACHINE: &str = "Device and networks";
+
+/// Options of every command of a program, before or after its name.
+#[derive(Debug, Args)]
+pub struct GlobalArgs {
+    /// Progress and messages on standard error: for people, or one JSON object per line
+    #[arg(long, global = true, value_enum, default_value = "text", value_name = "FORMAT")]
+    pub log: LogFormat,
+    /// What computes the networks, as far as the ONNX Runtime library can; auto: a GPU that
+    /// answers, or else the CPU
+    #[arg(long, global = true, value_parser = PossibleValuesParser::new(provider::NAMES), value_name = "NAME", help_heading = MACHINE)]
+    pub provider: Option<String>,
+}
 
 /// Options of the commands that make scenes, about files.
 #[derive(Clone, Debug, Args)]

@@ -72,7 +72,7 @@ fn shade(x: f32, y: f32) -> f32 {
     ((0.5 + wave) * 65535.0).round() / 65535.0
 }
 
-/// As in src/pose/stereo/tests.rs: near ties may resolve either way.
+/// Bound of src/pass/stereo_tests.rs: near ties may resolve either way.
 fn compare(a: &[Vec4], b: &[Vec4]) {
     let same: Vec<usize> = (0..a.len())
         .filter(|&k| (a[k].truncate() - b[k].truncate()).length() < 1e-4 * a[k].truncate().length())

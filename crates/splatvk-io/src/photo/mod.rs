@@ -42,7 +42,7 @@ pub use masks::{MaskChoice, assign as assign_masks};
 pub use overlay::Overlay;
 pub use read::{
     MAX_SIZE, MAX_SIZE_CPU, Photo, SMALLEST_SIDE, default_max_size, from_bytes, from_pixels,
-    from_used_pixels, load, load_at, working_size,
+    from_used_pixels, load, load_at, of_image, working_size,
 };
 pub use sizes::sizes_of;
 pub use straighten::Straightening;

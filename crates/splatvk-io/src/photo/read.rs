@@ -361,6 +361,11 @@ fn partly_used(
     Ok(Photo { coverage, masked, fine, ..bare(name, size, image) })
 }
 
+/// A photo whose file is its working image, without metadata.
+pub fn of_image(name: &Path, image: RgbImage) -> Photo {
+    bare(name, (image.width, image.height), image)
+}
+
 /// A photo of a working image, without metadata.
 fn bare(name: &Path, (w, h): (usize, usize), image: RgbImage) -> Photo {
     let working = (image.width as u32, image.height as u32);
