@@ -1,5 +1,6 @@
 //! Tests of [`super`].
 use super::*;
+use crate::fit::losses::Losses;
 use crate::fit::pose::PoseOptions;
 use crate::fit::schedule::Exponential;
 use crate::gpu::test_device;
@@ -54,6 +55,49 @@ fn worse_refined_cameras_are_discarded() {
     run.trainer.cameras[1] = turned(&cameras[1], DVec3::Y * 0.2);
     let (_, kept, _, refined) = run.finish().unwrap();
     assert!(!refined && kept == cameras);
+}
+
+/// Trained alone, each term approaches its own target; without a term nothing moves.
+#[test]
+fn each_loss_trains_its_own_target() {
+    let device = test_device();
+    let (mut start, cameras, images) = scene(&device);
+    // The largest ratio of the seeded splats is 6; from 8 on a splat is a needle.
+    start.log_scales[0][0] = start.log_scales[0][1] + 3.0;
+    let mut renderer = Renderer::new(&device, &start, &[], 0).unwrap();
+    let frames: Vec<_> = cameras.iter().map(|c| renderer.render(c).unwrap()).collect();
+    let farther =
+        |map: &Image<f32>| Image { data: map.data.iter().map(|z| 1.1 * z).collect(), ..map.clone() };
+    let confidence = Image::filled(75, 53, 1.0);
+    let depths: Vec<_> = frames
+        .iter()
+        .map(|f| DepthMap { depth: farther(&f.depth), confidence: confidence.clone() })
+        .collect();
+    let scale = SceneScale::measure(&cameras, &start.means);
+    let photos = Photos { images: &images, cameras: &cameras, depths: Some(&depths), coverage: &[] };
+    let trained = |depth, needles| {
+        let losses = Losses { l1: 0.0, dssim: 0.0, depth, needles };
+        let preset = RgbOptions::preset(Preset::Draft);
+        let options =
+            RgbOptions { losses, iterations: 10, half_res: 0.0, poses: None, bounded: false, ..preset };
+        let options = RgbOptions { prune_every: 0, ..options };
+        fit_photos(&device, photos, start.clone(), scale, &options, &crate::progress::Silent).unwrap().splats
+    };
+    let largest_ratio = |splats: &Splats| {
+        let range = |s: &[f32; 3]| s[0].max(s[1]).max(s[2]) - s[0].min(s[1]).min(s[2]);
+        splats.log_scales.iter().map(range).fold(0.0, f32::max)
+    };
+    let depth_error = |splats: &Splats| {
+        let shown = Renderer::new(&device, splats, &[], 0).unwrap().render(&cameras[0]).unwrap().depth;
+        let pairs = shown.data.iter().zip(&depths[0].depth.data).filter(|(z, d)| **z > 0.0 && **d > 0.0);
+        pairs.map(|(z, d)| f64::from((z - d).abs() / d)).sum::<f64>()
+    };
+    assert_eq!(trained(None, None), start);
+    let (round, moved) = (trained(None, Some(1.0)), trained(Some(1.0), None));
+    let ratios = [&round, &moved, &start].map(largest_ratio);
+    assert!(ratios[0] < ratios[2], "{ratios:?}");
+    let errors = [&moved, &round, &start].map(depth_error);
+    assert!(errors[0] < 0.9 * errors[2], "{errors:?}");
 }
 
 /// Coverage of the left half of a photo.
