@@ -2,21 +2,30 @@
 //! checked by central differences.
 mod support;
 use splatvk::gpu::{self, NATIVE_FLOAT_ATOMICS, Options, Recorder, TestDevice, test_device};
-use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction};
+use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, TileSums};
 use splatvk::scene::seeded;
 use support::{GpuGradients, Scene, assert_class, assert_gradients};
 
-/// Reduced by atomics and by entries; the latter is bit-reproducible.
+/// Reduced by atomics, with both reductions within a tile, and by entries; the latter is
+/// bit-reproducible.
 #[test]
 fn random_scenes_match_reference() {
     let device = test_device();
     let choices = |summation| DeviceChoices { summation, ..DeviceChoices::of(&device) };
     let (atomics, entries) = (choices(GradientReduction::Atomics), choices(GradientReduction::Entries));
-    for (n, sh_degree, dim) in [(1, 3, 3), (10, 3, 0), (100, 2, 8), (500, 1, 16), (100, 0, 48)] {
+    let tile_sums = match atomics.tile_sums {
+        TileSums::Shuffles => TileSums::Shared,
+        TileSums::Shared => TileSums::Shuffles,
+    };
+    let other_sums = DeviceChoices { tile_sums, ..atomics };
+    for (n, sh_degree, dim) in [(1, 3, 3), (10, 3, 0), (300, 1, 0), (100, 2, 8), (500, 1, 16), (100, 0, 48)] {
         let scene = Scene::small(n, sh_degree, dim, 60 + n as u64);
         println!("{n} splats, degree {sh_degree}, {dim} features");
         let upstream = scene.upstream(7);
         assert_gradients(&scene, &scene.gradients_by(&device, atomics, &upstream), 7);
+        if dim == 0 {
+            assert_gradients(&scene, &scene.gradients_by(&device, other_sums, &upstream), 7);
+        }
         let gradients = scene.gradients_by(&device, entries, &upstream);
         assert_gradients(&scene, &gradients, 7);
         assert_eq!(gradients, scene.gradients_by(&device, entries, &upstream));

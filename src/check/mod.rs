@@ -9,7 +9,7 @@ use crate::Result;
 use crate::gpu::{Device, Options};
 use crate::pass::sort::SortAlgorithm;
 use crate::pass::ssim_l1::SsimRowKernel;
-use crate::pass::{GradientReduction, KernelVariant, TileBinning};
+use crate::pass::{GradientReduction, KernelVariant, TileBinning, TileSums};
 use compared::Found;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -55,6 +55,8 @@ const CASES: &[Case] = &[
     case("gradients", Some(KernelVariant::StoredGradients), |d| {
         render::backward(d, GradientReduction::Entries)
     }),
+    case("gradients", Some(KernelVariant::ShuffledSums), |d| render::tile_sums(d, TileSums::Shuffles)),
+    case("gradients", Some(KernelVariant::SharedSums), |d| render::tile_sums(d, TileSums::Shared)),
     case("depth and needle losses", None, render::regularisers),
     case("SSIM and L1 loss", Some(KernelVariant::SsimStrips), |d| images::ssim_l1(d, SsimRowKernel::Strips)),
     case("SSIM and L1 loss", Some(KernelVariant::SsimShared), |d| images::ssim_l1(d, SsimRowKernel::Shared)),

@@ -8,7 +8,7 @@ use crate::pass::raster_forward::Cutoffs;
 use crate::pass::reference::{self, Forward};
 use crate::pass::{
     DeviceChoices, FeatureMode, GradientReduction, RasterOptions, Rasterizer, SplatBuffers, TileBinning,
-    View, regularise,
+    TileSums, View, regularise,
 };
 use crate::scene::Splats;
 use crate::scene::seeded;
@@ -20,6 +20,7 @@ const FEATURES: usize = 6;
 const MODE: FeatureMode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 2 };
 
 struct Scene {
+    dim: usize,
     splats: Splats,
     features: Vec<f32>,
     view: View,
@@ -27,16 +28,16 @@ struct Scene {
 }
 
 impl Scene {
-    fn new() -> Scene {
+    fn new(dim: usize) -> Scene {
         let (splats, camera) = seeded::small(150, SIZE[0], SIZE[1], 3, 11);
-        let features = seeded::features(splats.len(), FEATURES, 11);
+        let features = seeded::features(splats.len(), dim, 11);
         let view = View::new(&camera, 0.05).with_background([0.2, 0.4, 0.1]);
         let options = RasterOptions { sh_degree: 3, feature_mode: MODE, ..RasterOptions::default() };
-        Scene { splats, features, view, options }
+        Scene { dim, splats, features, view, options }
     }
 
     fn params(&self) -> Params {
-        Params::new(&self.splats, &self.features, FEATURES)
+        Params::new(&self.splats, &self.features, self.dim)
     }
 
     fn reference(&self) -> Forward {
@@ -44,8 +45,8 @@ impl Scene {
     }
 
     fn rendered(&self, device: &Device, choices: DeviceChoices) -> crate::Result<(SplatBuffers, Rasterizer)> {
-        let params = SplatBuffers::upload(device, &self.splats, &self.features, FEATURES)?;
-        let mut raster = Rasterizer::with(device, self.splats.len(), FEATURES, SIZE[0], SIZE[1], choices)?;
+        let params = SplatBuffers::upload(device, &self.splats, &self.features, self.dim)?;
+        let mut raster = Rasterizer::with(device, self.splats.len(), self.dim, SIZE[0], SIZE[1], choices)?;
         raster.set_view(&self.view)?;
         raster.forward(&params, &self.options)?;
         Ok((params, raster))
@@ -53,7 +54,7 @@ impl Scene {
 }
 
 pub(super) fn forward(device: &Device, grouping: TileBinning) -> Found {
-    let scene = Scene::new();
+    let scene = Scene::new(FEATURES);
     let (_, raster) = scene.rendered(device, DeviceChoices { grouping, ..DeviceChoices::of(device) })?;
     let reference = scene.reference();
     let (planes, rest) = (raster.frame().planes.read()?, raster.frame().transmittance.read()?);
@@ -64,11 +65,24 @@ pub(super) fn forward(device: &Device, grouping: TileBinning) -> Found {
 }
 
 pub(super) fn backward(device: &Device, summation: GradientReduction) -> Found {
-    let scene = Scene::new();
-    let (params, raster) =
-        scene.rendered(device, DeviceChoices { summation, ..DeviceChoices::of(device) })?;
+    gradients(device, FEATURES, DeviceChoices { summation, ..DeviceChoices::of(device) })
+}
+
+/// Without features: these use shuffles always.
+pub(super) fn tile_sums(device: &Device, tile_sums: TileSums) -> Found {
+    let choices = DeviceChoices {
+        summation: GradientReduction::Atomics,
+        tile_sums,
+        ..DeviceChoices::of(device)
+    };
+    gradients(device, 0, choices)
+}
+
+fn gradients(device: &Device, dim: usize, choices: DeviceChoices) -> Found {
+    let scene = Scene::new(dim);
+    let (params, raster) = scene.rendered(device, choices)?;
     let mut random = Random::new(12);
-    let values = (5 + FEATURES) * (SIZE[0] * SIZE[1]) as usize;
+    let values = (5 + dim) * (SIZE[0] * SIZE[1]) as usize;
     let upstream: Vec<f32> = (0..values).map(|_| random.scaled_normal(1.0) as f32).collect();
     raster.frame().planes_grad.write(&upstream)?;
     let gradients = params.zeros_like(device)?;
@@ -105,7 +119,7 @@ pub(super) fn backward(device: &Device, summation: GradientReduction) -> Found {
 }
 
 pub(super) fn regularisers(device: &Device) -> Found {
-    let scene = Scene::new();
+    let scene = Scene::new(FEATURES);
     let (params, raster) = scene.rendered(device, DeviceChoices::of(device))?;
     let frame = raster.frame();
     let pixels = frame.pixels() as usize;

@@ -37,6 +37,7 @@ pub struct FrameBuffers {
     pub(super) projected_grad: Buffer<f32>,
     pub(super) camera_parts: Buffer<f32>,
     pub(super) summation: GradientReduction,
+    pub(super) tile_sums: TileSums,
     pub(super) gradient_entries: GradientEntries,
     pub(super) codes: Buffer<f32>,
     pub(super) codes_grad: Buffer<f32>,
@@ -107,6 +108,29 @@ pub enum GradientReduction {
     /// bits on every run, for 48 bytes per entry and about a tenth more time per step (lavapipe,
     /// 100,000 splats).
     Entries,
+}
+
+/// Reduction of the gradients of one splat over the pixels of a tile, for the base channels and
+/// [`GradientReduction::Atomics`]. Blocks of features and stored entries use shuffles.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TileSums {
+    /// Butterflies of shuffles, for CPU devices: a barrier takes about a microsecond there.
+    Shuffles,
+    /// Sums over numbers per splat and pixel in shared memory, for GPUs.
+    Shared,
+}
+
+impl TileSums {
+    /// The faster reduction for the device, unless it is disabled.
+    pub fn of(device: &Device) -> TileSums {
+        let info = device.info();
+        match (if info.is_cpu { KernelVariant::ShuffledSums } else { KernelVariant::SharedSums })
+            .or_replacement(info)
+        {
+            KernelVariant::ShuffledSums => TileSums::Shuffles,
+            _ => TileSums::Shared,
+        }
+    }
 }
 
 /// Gradients per entry of the tile lists; allocated at first use, since rendering does not need

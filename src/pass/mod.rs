@@ -32,7 +32,7 @@ pub mod tile_lists;
 pub mod variants;
 pub mod view;
 
-pub use frame::{FrameBuffers, GradientReduction};
+pub use frame::{FrameBuffers, GradientReduction, TileSums};
 pub use options::{FeatureMode, RasterOptions};
 pub use rasterizer::{DeviceChoices, Rasterizer};
 pub use renderer::{RenderedFrame, Renderer};

@@ -12,7 +12,7 @@
 //! m₂, C m₂ + B m₁), ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
 use super::adam::rows_of_groups;
 use super::channels::{BASE_CHANNELS, Block, blocks};
-use super::frame::{EntryBuffers, FrameBuffers, GRADIENT_FLOATS, GradientReduction, Tiles};
+use super::frame::{EntryBuffers, FrameBuffers, GRADIENT_FLOATS, GradientReduction, TileSums, Tiles};
 use super::raster_forward::{Cutoffs, ReferenceScene, channels_of, push, walk};
 use crate::gpu::{Buffer, Recorder, shaders};
 
@@ -44,7 +44,11 @@ pub(super) fn record(
     match frame.summation {
         GradientReduction::Atomics => {
             for block in blocks(frame.feature_dim as u32) {
-                record_atomic(rec, frame, tiles, block, coupling);
+                if frame.tile_sums == TileSums::Shared && block.channels == BASE_CHANNELS as u32 {
+                    record_shared(rec, frame, tiles);
+                } else {
+                    record_atomic(rec, frame, tiles, block, coupling);
+                }
             }
         }
         GradientReduction::Entries => match frame.gradient_entries.buffers(rec.device(), frame) {
@@ -97,6 +101,31 @@ fn record_atomic(rec: &mut Recorder, frame: &FrameBuffers, tiles: &Tiles, block:
             projected_grad: &frame.projected_grad,
         },
         &push!(raster_backward, frame, tiles, block, alpha_plane: alpha_plane(frame), coupling: coupling),
+    );
+    rec.dispatch(call, [frame.tiles()[0], tiles.rows.len() as u32, 1]);
+}
+
+/// Records [`TileSums::Shared`] for an image without features.
+fn record_shared(rec: &mut Recorder, frame: &FrameBuffers, tiles: &Tiles) {
+    let call = shaders::raster_backward_shared::call(
+        &shaders::raster_backward_shared::Bindings {
+            projected: &frame.projected,
+            tile_ranges: &frame.lists.ranges,
+            tile_splats: &frame.lists.splats,
+            planes: &frame.planes,
+            planes_grad: &frame.planes_grad,
+            transmittance: &frame.transmittance,
+            projected_grad: &frame.projected_grad,
+        },
+        &shaders::raster_backward_shared::Push {
+            width: frame.width,
+            top: tiles.top,
+            rows: frame.bands.rows as u32,
+            first_row: tiles.rows.start,
+            list_row: tiles.list_row,
+            tiles_x: frame.tiles()[0],
+            alpha_plane: alpha_plane(frame),
+        },
     );
     rec.dispatch(call, [frame.tiles()[0], tiles.rows.len() as u32, 1]);
 }

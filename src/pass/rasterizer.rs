@@ -41,8 +41,8 @@
 use super::bands::{Band, Bands};
 use super::channels::BASE_CHANNELS;
 use super::frame::{
-    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, GradientReduction, PROJECTED_FLOATS, Tiles,
-    entry_bytes,
+    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, GradientReduction, PROJECTED_FLOATS, TileSums,
+    Tiles, entry_bytes,
 };
 use super::sort::Sort;
 use super::tile_lists::{self, LONGEST_LIST, TILE, TileBinning, TileLists};
@@ -64,12 +64,18 @@ pub struct DeviceChoices {
     pub grouping: TileBinning,
     /// Reduction of the gradients over tiles.
     pub summation: GradientReduction,
+    /// Reduction of the gradients over the pixels of a tile.
+    pub tile_sums: TileSums,
 }
 
 impl DeviceChoices {
     /// Fastest choices for the device.
     pub fn of(device: &Device) -> DeviceChoices {
-        DeviceChoices { grouping: TileBinning::of(device), summation: GradientReduction::of(device) }
+        DeviceChoices {
+            grouping: TileBinning::of(device),
+            summation: GradientReduction::of(device),
+            tile_sums: TileSums::of(device),
+        }
     }
 }
 
@@ -157,6 +163,7 @@ impl Rasterizer {
                 CAMERA_GRADIENTS * project_backward::groups(device, splats) as usize,
             )?,
             summation: choices.summation,
+            tile_sums: choices.tile_sums,
             gradient_entries: GradientEntries::default(),
             codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
             codes_grad: device.buffer::<f32>("codes_grad", (stride * splats).max(4))?,

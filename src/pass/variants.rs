@@ -11,6 +11,10 @@ pub enum KernelVariant {
     AtomicGradients,
     /// Gradients stored per tile and summed in order ([`crate::pass::GradientReduction::Entries`]).
     StoredGradients,
+    /// Gradients of a tile reduced by shuffles ([`crate::pass::TileSums::Shuffles`]).
+    ShuffledSums,
+    /// Gradients of a tile reduced in shared memory ([`crate::pass::TileSums::Shared`]).
+    SharedSums,
     /// Radix sort with a chunk per lane ([`crate::pass::sort::SortAlgorithm::Chunks`]).
     ChunkSort,
     /// OneSweep radix sort ([`crate::pass::sort::SortAlgorithm::Sweep`]).
@@ -27,10 +31,12 @@ pub enum KernelVariant {
 
 impl KernelVariant {
     /// All of them.
-    pub const ALL: [KernelVariant; 9] = [
+    pub const ALL: [KernelVariant; 11] = [
         KernelVariant::FloatAtomics,
         KernelVariant::AtomicGradients,
         KernelVariant::StoredGradients,
+        KernelVariant::ShuffledSums,
+        KernelVariant::SharedSums,
         KernelVariant::ChunkSort,
         KernelVariant::SweepSort,
         KernelVariant::CountedLists,
@@ -45,6 +51,8 @@ impl KernelVariant {
             KernelVariant::FloatAtomics => NATIVE_FLOAT_ATOMICS,
             KernelVariant::AtomicGradients => "gradients by atomics",
             KernelVariant::StoredGradients => "gradients by stored entries",
+            KernelVariant::ShuffledSums => "tile sums by shuffles",
+            KernelVariant::SharedSums => "tile sums in shared memory",
             KernelVariant::ChunkSort => "sort in chunks",
             KernelVariant::SweepSort => "sort in one sweep",
             KernelVariant::CountedLists => "tile lists by counters",
@@ -60,6 +68,8 @@ impl KernelVariant {
             KernelVariant::FloatAtomics => KernelVariant::AtomicGradients,
             KernelVariant::AtomicGradients => KernelVariant::StoredGradients,
             KernelVariant::StoredGradients => KernelVariant::AtomicGradients,
+            KernelVariant::ShuffledSums => KernelVariant::SharedSums,
+            KernelVariant::SharedSums => KernelVariant::ShuffledSums,
             KernelVariant::ChunkSort => KernelVariant::SweepSort,
             KernelVariant::SweepSort => KernelVariant::ChunkSort,
             KernelVariant::CountedLists => KernelVariant::SortedLists,
@@ -83,7 +93,7 @@ mod tests {
     use crate::gpu::{Options, TestDevice, options, test_device};
     use crate::pass::sort::SortAlgorithm;
     use crate::pass::ssim_l1::SsimRowKernel;
-    use crate::pass::{GradientReduction, TileBinning};
+    use crate::pass::{GradientReduction, TileBinning, TileSums};
 
     #[test]
     fn disabled_variants_are_replaced() {
@@ -97,11 +107,17 @@ mod tests {
         let device = without(&most);
         assert_eq!(SortAlgorithm::of(&device), SortAlgorithm::Sweep);
         assert_eq!(SsimRowKernel::of(&device), SsimRowKernel::of(&usual));
+        assert_eq!(TileSums::of(&device), TileSums::of(&usual));
         assert!(!device.info().float_atomics);
         // Both variants are disabled, so neither replaces the other.
         assert_eq!(GradientReduction::of(&device), GradientReduction::of(&usual));
         assert_eq!(TileBinning::of(&device), TileBinning::of(&usual));
-        let device = without(&[KernelVariant::AtomicGradients, KernelVariant::CountedLists]);
+        let device = without(&[
+            KernelVariant::AtomicGradients,
+            KernelVariant::CountedLists,
+            KernelVariant::ShuffledSums,
+        ]);
+        assert_eq!(TileSums::of(&device), TileSums::Shared);
         assert_eq!(GradientReduction::of(&device), GradientReduction::Entries);
         assert_eq!(TileBinning::of(&device), TileBinning::Sorting);
         assert_eq!(device.info().float_atomics, usual.info().float_atomics);

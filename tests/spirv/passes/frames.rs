@@ -7,7 +7,7 @@ use splatvk::gpu::{Device, Recorder};
 use splatvk::math::Random;
 use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
 use splatvk::pass::raster_forward::{Cutoffs, ReferenceScene, walk};
-use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, Rasterizer};
+use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, Rasterizer, TileSums};
 use splatvk::pass::{decode as decoding, pack as packing, pairs as counting};
 use splatvk::scene::seeded;
 
@@ -69,7 +69,23 @@ fn by_atomics(device: &Device) -> DeviceChoices {
 }
 
 pub fn colours(device: &Device) {
-    check_both_directions(device, &scene(40, 3, 0, 1040), by_atomics(device));
+    for tile_sums in [TileSums::Shuffles, TileSums::Shared] {
+        let ways = DeviceChoices { tile_sums, ..by_atomics(device) };
+        check_both_directions(device, &scene(40, 3, 0, 1040), ways);
+    }
+}
+
+/// A splat far beside the image, splats on every border of tiles, and more splats per tile than a
+/// subgroup has lanes.
+pub fn shared_tile_sums(device: &Device) {
+    let ways = DeviceChoices { tile_sums: TileSums::Shared, ..by_atomics(device) };
+    let mut large = scene(70, 0, 0, 1051);
+    large.splats.log_scales.fill([3.0, 2.5, 2.0]);
+    large.splats.opacity_logits.fill(-3.0);
+    check_both_directions(device, &large, ways);
+    let mut beyond = scene(20, 0, 0, 1053);
+    beyond.view.focal = beyond.view.focal.map(|f| 1.6 * f);
+    check_both_directions(device, &beyond, ways);
 }
 
 pub fn few_features(device: &Device) {

@@ -35,6 +35,7 @@ pub const PLAIN: &[(&str, Scene)] = &[
 /// Scenes with float atomics.
 pub const ADDING: &[(&str, Scene)] = &[
     ("colours", frames::colours),
+    ("tile sums in shared memory", frames::shared_tile_sums),
     ("3 features", frames::few_features),
     ("8 features", frames::eight_features),
     ("21 features", frames::many_features),
