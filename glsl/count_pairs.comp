@@ -33,17 +33,18 @@ void main() {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
         T[k] = select(both(x < width, y < height), 1.0, -1.0);
     }
+    begin_batches(first, last, lane);
     for (uint j = first; j < last; j += SUBGROUP_SIZE) {
-        load_splat(tile_splats[min(j + lane, last - 1)].x, j + lane < last);
+        load_batch(j, last, lane);
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
         evaluated += batch * PIXELS;
         for (uint i = 0; i < batch; i++) {
-            float dx0 = subgroupShuffle(own_u, i) - origin.x, dy0 = subgroupShuffle(own_v, i) - origin.y;
-            float a = subgroupShuffle(own_a, i), b = subgroupShuffle(own_b, i), c = subgroupShuffle(own_c, i);
-            float log2_opacity = subgroupShuffle(own_log2_opacity, i);
+            vec2 offset = centre_of(i) - origin;
+            vec3 conic = conic_of(i);
+            float log2_opacity = log2_opacity_of(i);
             [[unroll]] for (int k = 0; k < PIXELS; k++) {
-                float dx = dx0 - float((k / ROWS) * LANES_X), dy = dy0 - float((k % ROWS) * LANES_Y);
-                float power = fma(fma(c, dy, b * dx), dy, fma(a * dx, dx, log2_opacity));
+                float dx = offset.x - float((k / ROWS) * LANES_X), dy = offset.y - float((k % ROWS) * LANES_Y);
+                float power = fma(fma(conic.z, dy, conic.y * dx), dy, fma(conic.x * dx, dx, log2_opacity));
                 float alpha = select(power >= LOG2_ALPHA_MIN, min(ALPHA_MAX, exp2(power)), 0.0);
                 float next = T[k] - alpha * T[k];
                 bool stop = next < TRANSMITTANCE_MIN;

@@ -28,21 +28,19 @@ layout(push_constant) uniform Push {
     uint width; uint top; uint rows; uint first_row; uint list_row; uint tiles_x; uint alpha_plane;
 };
 
+#define SHARED_SPLATS 1
 #include "shared/raster.glsl"
 
 // A group of splats is evaluated pixel by pixel; then each lane sums one splat over one part of the
 // tile: two rows of pixels.
-#define PARTS 4
+#define PARTS 4 // the numbers of a vector
 #define PART_ROWS (TILE / PARTS)
 #define PART_PIXELS (TILE * PART_ROWS)
 #define GROUP (SUBGROUP_SIZE / PARTS)
 // One number of padding per part: the lanes of a half subgroup then read different banks.
 #define PART_STRIDE (PART_PIXELS + 1)
 #define SPLAT_STRIDE (PARTS * PART_STRIDE)
-// Values of a splat that a lane adds to memory.
-#define OWN_VALUES (GRADIENT_FLOATS / PARTS)
 
-shared vec4 splats[PROJECTED_VECTORS * SUBGROUP_SIZE];
 // (w, σ) of every splat of a group and pixel.
 shared vec2 factors[GROUP * SPLAT_STRIDE];
 // Gradient by RGB and depth of every pixel.
@@ -53,16 +51,17 @@ vec4 upstream[PIXELS];
 
 // Stores (w, σ) of the pixels of this lane and splat i of the batch as splat `slot` of the group.
 void evaluate(uint i, uint slot, uint lane, vec2 origin) {
-    vec4 p = splats[PROJECTED_VECTORS * i], q = splats[PROJECTED_VECTORS * i + 1];
-    vec4 value = splats[PROJECTED_VECTORS * i + 2];
-    float dx0 = p.x - origin.x, dy0 = p.y - origin.y;
+    vec2 offset = centre_of(i) - origin;
+    vec3 conic = conic_of(i);
+    float log2_opacity = log2_opacity_of(i);
+    load_values(i);
     [[unroll]] for (int n = 0; n < COLUMNS; n++) {
-        float dx = dx0 - float(n * LANES_X);
-        float ax = fma(p.z * dx, dx, q.y), bx = p.w * dx;
+        float dx = offset.x - float(n * LANES_X);
+        float ax = fma(conic.x * dx, dx, log2_opacity), bx = conic.y * dx;
         [[unroll]] for (int m = 0; m < ROWS; m++) {
             const int k = n * ROWS + m;
-            float dy = dy0 - float(m * LANES_Y);
-            float power = fma(fma(q.x, dy, bx), dy, ax), raw = exp2(power);
+            float dy = offset.y - float(m * LANES_Y);
+            float power = fma(fma(conic.z, dy, bx), dy, ax), raw = exp2(power);
             // The comparison of raster_forward.comp, so that both passes take the same splats.
             float alpha = select(power >= LOG2_ALPHA_MIN, min(ALPHA_MAX, raw), 0.0);
             float w = alpha * T[k], next = T[k] - w;
@@ -71,7 +70,7 @@ void evaluate(uint i, uint slot, uint lane, vec2 origin) {
             // α / (1 − α), 0 where no gradient may reach the geometry.
             float ratio = select(both(!stop, raw <= ALPHA_MAX), alpha / (1.0 - alpha), 0.0);
             T[k] = select(stop, -abs(T[k]), next);
-            float own = dot(value, upstream[k]);
+            float own = dot(values[0], upstream[k]);
             behind[k] = fma(-weight, own, behind[k]);
             float sigma = ratio * (T[k] * own - behind[k]);
             uint x = lane % LANES_X + n * LANES_X, y = lane / LANES_X + m * LANES_Y;
@@ -108,19 +107,15 @@ void main() {
     vec4 part_grad[PART_PIXELS];
     [[unroll]] for (int k = 0; k < PART_PIXELS; k++) part_grad[k] = pixel_grad[part * PART_PIXELS + k];
 
+    begin_batches(first, last, lane);
     for (uint j = first; j < last; j += SUBGROUP_SIZE) {
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
-        uint splat = tile_splats[min(j + lane, last - 1)].x;
-        [[unroll]] for (int k = 0; k < PROJECTED_VECTORS; k++)
-            splats[PROJECTED_VECTORS * lane + k] = projected[PROJECTED_VECTORS * splat + k];
-        // Splats behind the end of the list touch no pixel.
-        if (lane >= batch) splats[PROJECTED_VECTORS * lane + 1].y = -1e4;
-        barrier();
+        load_batch(j, last, lane);
         for (uint base = 0; base < batch; base += GROUP) {
             [[unroll]] for (int n = 0; n < GROUP; n++) evaluate(base + n, n, lane, vec2(corner));
             barrier();
             uint i = base + slot;
-            vec2 centre = splats[PROJECTED_VECTORS * i].xy - vec2(tile_corner);
+            vec2 centre = centre_of(i) - vec2(tile_corner);
             vec4 colour = vec4(0.0);
             float sums[GRADIENT_FLOATS];
             [[unroll]] for (int n = 0; n < GRADIENT_FLOATS; n++) sums[n] = 0.0;
@@ -144,23 +139,22 @@ void main() {
                 sums[5] = fma(s0 * dy, dy, sums[5]);
             }
             [[unroll]] for (int n = 0; n < CHANNELS; n++) sums[MOMENTS + n] = colour[n];
-            // The four parts of a splat exchange halves, then quarters: each lane keeps the sums of
-            // OWN_VALUES values.
+            // The four parts of a splat exchange halves, then quarters: part p keeps the sums of
+            // numbers p, p + 4 and p + 8, so that the four parts add to one vector at a time.
             bool upper = (part & 2u) != 0u, odd = (part & 1u) != 0u;
-            [[unroll]] for (int n = 0; n < 2 * OWN_VALUES; n++) {
-                float low = sums[n], high = sums[n + 2 * OWN_VALUES];
-                sums[n] = select(upper, high, low) + subgroupShuffleXor(select(upper, low, high), 2);
+            [[unroll]] for (int n = 0; n < 2 * GRADIENT_VECTORS; n++) {
+                int at = PARTS * (n / 2) + n % 2;
+                float low = sums[at], high = sums[at + 2];
+                sums[at] = select(upper, high, low) + subgroupShuffleXor(select(upper, low, high), 2);
             }
-            [[unroll]] for (int n = 0; n < OWN_VALUES; n++) {
-                float low = sums[n], high = sums[n + OWN_VALUES];
-                sums[n] = select(odd, high, low) + subgroupShuffleXor(select(odd, low, high), 1);
-            }
-            uint target = subgroupShuffle(splat, i);
-            [[unroll]] for (int n = 0; n < OWN_VALUES; n++) {
-                uint at = OWN_VALUES * part + n;
-                // No pixel of the tile sees a quarter of the splats on its list.
-                if (sums[n] != 0.0 && at < MOMENTS + BASE_CHANNELS)
-                    ATOMIC_ADD(projected_grad[GRADIENT_FLOATS * target + at], sums[n]);
+            uint target = subgroupShuffle(own_item.x, i);
+            [[unroll]] for (int n = 0; n < GRADIENT_VECTORS; n++) {
+                float low = sums[PARTS * n], high = sums[PARTS * n + 1];
+                float sum = select(odd, high, low) + subgroupShuffleXor(select(odd, low, high), 1);
+                uint at = PARTS * n + part;
+                // Some splats of a list reach no pixel of the tile.
+                if (sum != 0.0 && at < MOMENTS + BASE_CHANNELS)
+                    ATOMIC_ADD(projected_grad[GRADIENT_FLOATS * target + at], sum);
             }
             barrier();
         }

@@ -34,6 +34,39 @@ layout(push_constant) uniform Push {
 #include "shared/camera.glsl"
 #include "shared/raster.glsl"
 
+// Splats of a batch whose arithmetic overlaps. Splats behind the end of a list reach no pixel.
+#define UNROLLED (!SHARED_SPLATS ? 1 : CHANNELS == BASE_CHANNELS ? 8 : 2)
+
+// A negative T marks a pixel that has stopped, as are pixels beyond the border from the start.
+float T[PIXELS], sum[CHANNELS * PIXELS];
+
+void blend(uint i, vec2 origin) {
+    vec2 offset = centre_of(i) - origin;
+    vec3 conic = conic_of(i);
+    float log2_opacity = log2_opacity_of(i);
+    float weight[PIXELS];
+    [[unroll]] for (int n = 0; n < COLUMNS; n++) {
+        float dx = offset.x - float(n * LANES_X);
+        float ax = fma(conic.x * dx, dx, log2_opacity), bx = conic.y * dx;
+        [[unroll]] for (int m = 0; m < ROWS; m++) {
+            const int k = n * ROWS + m;
+            float dy = offset.y - float(m * LANES_Y);
+            float power = fma(fma(conic.z, dy, bx), dy, ax);
+            float alpha = select(power >= LOG2_ALPHA_MIN, min(ALPHA_MAX, exp2(power)), 0.0);
+            float w = alpha * T[k], next = T[k] - w;
+            bool stop = next < TRANSMITTANCE_MIN;
+            weight[k] = select(stop, 0.0, w);
+            T[k] = select(stop, -abs(T[k]), next);
+        }
+    }
+    load_values(i);
+    [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
+        float value = value_of(i, channel);
+        [[unroll]] for (int k = 0; k < PIXELS; k++)
+            sum[channel * PIXELS + k] = fma(weight[k], value, sum[channel * PIXELS + k]);
+    }
+}
+
 void main() {
     uint lane = gl_SubgroupInvocationID;
     uint tile_row = gl_WorkGroupID.y + first_row, bottom = top + rows;
@@ -42,42 +75,18 @@ void main() {
     vec2 origin = vec2(corner);
     uint first = tile_ranges[tile], last = tile_ranges[tile + 1];
 
-    // A negative T marks a pixel that has stopped, as are pixels beyond the border from the start.
-    float T[PIXELS], sum[CHANNELS * PIXELS];
     [[unroll]] for (int k = 0; k < PIXELS; k++) {
         uint x = corner.x + (k / ROWS) * LANES_X, y = corner.y + (k % ROWS) * LANES_Y;
         T[k] = select(both(x < width, y < bottom), 1.0, -1.0);
     }
     [[unroll]] for (int k = 0; k < CHANNELS * PIXELS; k++) sum[k] = 0.0;
 
+    begin_batches(first, last, lane);
     for (uint j = first; j < last; j += SUBGROUP_SIZE) {
-        load_splat(tile_splats[min(j + lane, last - 1)].x, j + lane < last);
+        load_batch(j, last, lane);
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
-        for (uint i = 0; i < batch; i++) {
-            float dx0 = subgroupShuffle(own_u, i) - origin.x, dy0 = subgroupShuffle(own_v, i) - origin.y;
-            float a = subgroupShuffle(own_a, i), b = subgroupShuffle(own_b, i), c = subgroupShuffle(own_c, i);
-            float log2_opacity = subgroupShuffle(own_log2_opacity, i);
-            float weight[PIXELS];
-            [[unroll]] for (int n = 0; n < COLUMNS; n++) {
-                float dx = dx0 - float(n * LANES_X);
-                float ax = fma(a * dx, dx, log2_opacity), bx = b * dx;
-                [[unroll]] for (int m = 0; m < ROWS; m++) {
-                    const int k = n * ROWS + m;
-                    float dy = dy0 - float(m * LANES_Y);
-                    float power = fma(fma(c, dy, bx), dy, ax);
-                    float alpha = select(power >= LOG2_ALPHA_MIN, min(ALPHA_MAX, exp2(power)), 0.0);
-                    float w = alpha * T[k], next = T[k] - w;
-                    bool stop = next < TRANSMITTANCE_MIN;
-                    weight[k] = select(stop, 0.0, w);
-                    T[k] = select(stop, -abs(T[k]), next);
-                }
-            }
-            [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
-                float value = subgroupShuffle(own_value[channel], i);
-                [[unroll]] for (int k = 0; k < PIXELS; k++)
-                    sum[channel * PIXELS + k] = fma(weight[k], value, sum[channel * PIXELS + k]);
-            }
-        }
+        for (uint i = 0; i < batch; i += UNROLLED)
+            [[unroll]] for (int n = 0; n < UNROLLED; n++) blend(i + n, origin);
         if (all_stopped(T)) break;
     }
 

@@ -51,20 +51,20 @@ float T[PIXELS], behind[PIXELS], upstream[CHANNELS * PIXELS];
 float part[VALUES];
 
 void evaluate(uint i, vec2 origin) {
-    float dx0 = subgroupShuffle(own_u, i) - origin.x, dy0 = subgroupShuffle(own_v, i) - origin.y;
-    float a = subgroupShuffle(own_a, i), b = subgroupShuffle(own_b, i), c = subgroupShuffle(own_c, i);
-    float log2_opacity = subgroupShuffle(own_log2_opacity, i);
+    vec2 offset = centre_of(i) - origin;
+    vec3 conic = conic_of(i);
+    float log2_opacity = log2_opacity_of(i);
     // ratio = α / (1 − α), 0 where no gradient may reach the geometry
     float weight[PIXELS], ratio[PIXELS], own[PIXELS];
     [[unroll]] for (int n = 0; n < COLUMNS; n++) {
-        float dx = dx0 - float(n * LANES_X);
-        float ax = fma(a * dx, dx, log2_opacity), bx = b * dx;
+        float dx = offset.x - float(n * LANES_X);
+        float ax = fma(conic.x * dx, dx, log2_opacity), bx = conic.y * dx;
         [[unroll]] for (int m = 0; m < ROWS; m++) {
             const int k = n * ROWS + m;
-            float dy = dy0 - float(m * LANES_Y);
-            float raw = exp2(fma(fma(c, dy, bx), dy, ax));
+            float dy = offset.y - float(m * LANES_Y);
+            float raw = exp2(fma(fma(conic.z, dy, bx), dy, ax));
             // The comparison of raster_forward.comp, so that both passes take the same splats.
-            float alpha = select(fma(fma(c, dy, bx), dy, ax) >= LOG2_ALPHA_MIN, min(ALPHA_MAX, raw), 0.0);
+            float alpha = select(fma(fma(conic.z, dy, bx), dy, ax) >= LOG2_ALPHA_MIN, min(ALPHA_MAX, raw), 0.0);
             float w = alpha * T[k], next = T[k] - w;
             bool stop = next < TRANSMITTANCE_MIN;
             weight[k] = select(stop, 0.0, w);
@@ -73,8 +73,9 @@ void evaluate(uint i, vec2 origin) {
             own[k] = 0.0;
         }
     }
+    load_values(i);
     [[unroll]] for (int channel = 0; channel < CHANNELS; channel++) {
-        float value = subgroupShuffle(own_value[channel], i);
+        float value = value_of(i, channel);
         float felt = value * (channel < CHANNELS - FEATURES ? 1.0 : coupling);
         float sum = 0.0;
         [[unroll]] for (int k = 0; k < PIXELS; k++) {
@@ -85,11 +86,11 @@ void evaluate(uint i, vec2 origin) {
     }
     [[unroll]] for (int k = 0; k < MOMENTS; k++) part[k] = 0.0;
     [[unroll]] for (int n = 0; n < COLUMNS; n++) {
-        float dx = dx0 - float(n * LANES_X);
+        float dx = offset.x - float(n * LANES_X);
         float m0 = 0.0, m1 = 0.0, m2 = 0.0;
         [[unroll]] for (int m = 0; m < ROWS; m++) {
             const int k = n * ROWS + m;
-            float dy = dy0 - float(m * LANES_Y);
+            float dy = offset.y - float(m * LANES_Y);
             behind[k] = fma(-weight[k], own[k], behind[k]);
             float sigma = ratio[k] * (T[k] * own[k] - behind[k]);
             float sigma_y = sigma * dy;
@@ -163,10 +164,10 @@ void main() {
 #endif
     }
 
+    begin_batches(first, last, lane);
     uint j = first;
     while (j < last) {
-        uvec2 item = tile_splats[min(j + lane, last - 1)];
-        load_splat(item.x, j + lane < last);
+        load_batch(j, last, lane);
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
         // Both halves of the subgroup keep their own half sum of splat i, and one exchange after
         // the loop completes them. That saves a shuffle per value and splat.
@@ -202,7 +203,7 @@ void main() {
             low[n] = own;
         }
         [[unroll]] for (int n = 0; n < VALUES; n++) low[n] += high[n];
-        if (j + lane < last) store_gradients(item, low);
+        if (j + lane < last) store_gradients(own_item, low);
         j += SUBGROUP_SIZE;
         if (all_stopped(T)) break;
     }

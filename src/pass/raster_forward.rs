@@ -4,7 +4,6 @@
 //! min(0.99, o eᵖ)`; a splat with α < 1/255 is skipped; the pixel stops before the splat that would
 //! bring T below 1e-4; every channel adds `c α T`, then `T ← T(1 − α)`. Channels: RGB (plus T_f ·
 //! background), Σ w z (expected depth, not yet divided by alpha), d features (no background).
-//! Median depth is the z at which T falls below ½.
 use super::channels::blocks;
 use super::frame::{FrameBuffers, Tiles};
 use super::project::Projected;
