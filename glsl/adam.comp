@@ -1,15 +1,14 @@
 #version 460
-// One Adam step (Kingma & Ba 2015) on `count` parameters; beta1 0.9, beta2 0.999, eps 1e-15 as in
-// 3D Gaussian splatting. The host computes the bias corrections in f64 and writes rates[slot] =
-// (head rate, tail rate, second, unused) before each step, so one recording serves all steps: the
-// rates include 1/(1-beta1^t), second is 1/sqrt(1-beta2^t).
-//   p -= rate * m / (sqrt(v) * second + eps)
+// One Adam step on `count` parameters (shared/adam.glsl). The host computes the bias corrections in
+// f64 and writes rates[slot] = (head rate, tail rate, second, unused) before each step, so one
+// recording serves all steps: the rates include 1/(1-beta1^t), second is 1/sqrt(1-beta2^t).
 // The first `head` of every `stride` parameters use the head rate, the others the tail rate (SH: DC
 // and the rest). The guard is the status of the rasteriser: a frame whose tile lists overflowed has
 // no gradients, and the step is repeated. A parameter whose gradient is not finite stays and is
 // counted in `faults`; the host then stops with an error. Four parameters per thread: on a CPU
 // device an access costs the same at any width, on a GPU it is coalesced either way. Buffers are
 // padded to whole vectors: the last thread may have one vector of moments instead of two.
+#extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 256) in;
 layout(std430, binding = 0) buffer Parameters { vec4 parameters[]; };
@@ -21,7 +20,7 @@ layout(std430, binding = 4) readonly buffer Rates { vec4 rates[]; };
 // [2]; the step is void where guard[1] is not 0.
 layout(std430, binding = 5) readonly buffer Guard { uint guard[]; };
 layout(push_constant) uniform Push { uint count; uint stride; uint head; uint slot; };
-const float BETA1 = 0.9, BETA2 = 0.999, EPS = 1e-15;
+#include "shared/adam.glsl"
 
 void main() {
     // Two-dimensional, since one dimension ends at 65535 workgroups on some devices.
@@ -31,22 +30,14 @@ void main() {
     bool two = 4u * i + 2u < count;
     vec4 pair[2] = vec4[2](moments[2u * i], vec4(0.0));
     if (two) pair[1] = moments[2u * i + 1u];
-    vec4 step_rates = rates[slot];
+    vec4 step_rates = rates[slot], rate;
     uint column = 4u * i % stride, bad = 0u;
     [[unroll]] for (uint k = 0u; k < 4u; k++) {
-        float g = gradient[k];
-        // Drivers may optimise isnan and isinf away.
-        bool finite = (floatBitsToUint(g) & 0x7f800000u) != 0x7f800000u;
-        vec2 mv = vec2(pair[k / 2u][2u * (k % 2u)], pair[k / 2u][2u * (k % 2u) + 1u]);
-        vec2 next = vec2(BETA1 * mv.x + (1.0 - BETA1) * g, BETA2 * mv.y + (1.0 - BETA2) * g * g);
-        float rate = column < head ? step_rates.x : step_rates.y;
-        float change = rate * next.x / (sqrt(next.y) * step_rates.z + EPS);
-        parameter[k] = finite ? parameter[k] - change : parameter[k];
-        pair[k / 2u][2u * (k % 2u)] = finite ? next.x : mv.x;
-        pair[k / 2u][2u * (k % 2u) + 1u] = finite ? next.y : mv.y;
-        bad += finite || 4u * i + k >= count ? 0u : 1u;
+        rate[k] = column < head ? step_rates.x : step_rates.y;
         column = column + 1u == stride ? 0u : column + 1u;
     }
+    bvec4 finite = adam(parameter, pair, gradient, rate, step_rates.z);
+    [[unroll]] for (uint k = 0u; k < 4u; k++) bad += finite[k] || 4u * i + k >= count ? 0u : 1u;
     parameters[i] = parameter;
     moments[2u * i] = pair[0];
     if (two) moments[2u * i + 1u] = pair[1];

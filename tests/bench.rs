@@ -59,7 +59,7 @@ fn bench_training_times_add_up() {
     let back = ["regularisers", "raster backward", "projection backward", "Adam"];
     check_step(colour, &[forward.as_slice(), &back].concat());
     let features = bench.report.section("training step, 5 features").unwrap();
-    let back = ["feature loss", "raster backward", "projection backward", "Adam"];
+    let back = ["feature loss", "raster backward", "projection backward", "Adam", "feature backward"];
     check_step(features, &[forward.as_slice(), &back].concat());
     let steps = [colour, features].map(|s| s.row("training step").unwrap().ms.median);
     let ratio = features.value("step / step on colour alone").unwrap();

@@ -2,8 +2,8 @@
 //! checked by central differences.
 mod support;
 use splatvk::gpu::{self, NATIVE_FLOAT_ATOMICS, Options, Recorder, TestDevice, test_device};
-use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, TileSums};
-use splatvk::scene::seeded;
+use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, ShGradientKernel, TileSums};
+use splatvk::scene::{seeded, sh_coefficients};
 use support::{GpuGradients, Scene, assert_class, assert_gradients};
 
 /// Reduced by atomics, with both reductions within a tile, and by entries; the latter is
@@ -214,5 +214,32 @@ fn partial_launch_widths_match_reference() {
             let ways = DeviceChoices { summation, ..DeviceChoices::of(&device) };
             assert_gradients(&scene, &scene.gradients_by(&device, ways, &upstream), 9);
         }
+    }
+}
+
+/// Each degree, a degree below that of the coefficients, and more splats than a CPU device has
+/// threads. The kernels compute the same products of the same factors.
+#[test]
+fn sh_gradient_kernels_match_reference() {
+    let device = test_device();
+    let kernels = [ShGradientKernel::PerThread, ShGradientKernel::Shared];
+    let ways = kernels.map(|sh_gradients| DeviceChoices {
+        sh_gradients,
+        summation: GradientReduction::Entries,
+        ..DeviceChoices::of(&device)
+    });
+    for (n, sh_degree) in [(70, 0), (100, 1), (64, 2), (64 * 64 + 900, 3)] {
+        let (splats, camera) = seeded::benchmark(n, 40, 24, sh_degree, 69);
+        let mut scene = Scene::new(splats, &camera, 0, 69);
+        let upstream = scene.upstream(12);
+        let both = ways.map(|ways| scene.gradients_by(&device, ways, &upstream));
+        assert_gradients(&scene, &both[1], 12);
+        assert_eq!(both[0], both[1]);
+        scene.options.sh_degree = sh_degree / 2;
+        let both = ways.map(|ways| scene.gradients_by(&device, ways, &upstream));
+        assert_eq!(both[0], both[1]);
+        let used = |i: usize| i % (3 * scene.splats.sh_len()) < 3 * sh_coefficients(sh_degree / 2);
+        let sh = both[1].splats.sh.iter().enumerate();
+        assert!(sh.filter(|(i, v)| !used(*i) && **v != 0.0).count() == 0, "unused coefficients");
     }
 }

@@ -6,6 +6,7 @@
 //! splat PROJECTED_FLOATS. Operations are counted from the formulas of the passes, a fused
 //! multiply-add as two, an exponential as one.
 use crate::gpu::shaders;
+use crate::pass::fused_update;
 
 /// Limits of the device.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -38,6 +39,8 @@ pub struct PassWork {
     pub intersections: f64,
     /// Pixel–splat pairs that change a pixel.
     pub blended: f64,
+    /// Whether projection backward, the penalty on needles and Adam are one pass.
+    pub fused: bool,
 }
 
 /// Geometry and opacity of a splat, bytes.
@@ -56,7 +59,7 @@ const WEIGH_BACK: f64 = 30.0;
 impl PassWork {
     /// (bytes, operations) of a pass by its name in a recording; `None` for passes without a model.
     pub fn of(&self, pass: &str) -> Option<(f64, f64)> {
-        let PassWork { splats: n, sh, features: d, pixels, intersections, blended } = *self;
+        let PassWork { splats: n, sh, features: d, pixels, intersections, blended, fused } = *self;
         let (colour, channels) = (12.0 * sh, 4.0 + d);
         let listed = intersections * (4.0 + PROJECTED + 4.0 * d);
         Some(match pass {
@@ -70,17 +73,24 @@ impl PassWork {
             // derivatives.
             "SSIM + L1" => (3.0 * pixels * 12.0, 3.0 * pixels * (7.0 * 44.0 + 40.0)),
             "feature loss" => (pixels * (8.0 * d + 8.0), 3.0 * pixels * d),
+            "regularisers" if fused => (8.0 * pixels, 0.0),
             "regularisers" => (8.0 * pixels + 36.0 * n, 10.0 * n),
             // Gradients of a projected splat are added once per list entry: read and written.
             "raster backward" => (
                 listed + 8.0 * intersections * (6.0 + channels) + 8.0 * pixels * (channels + 1.0),
                 blended * (WEIGH + WEIGH_BACK + 4.0 * channels),
             ),
-            "projection backward" => {
-                (n * (2.0 * (GEOMETRY + colour) + PROJECTED + 12.0 * d), n * (600.0 + 12.0 * sh))
+            "projection backward" => (n * (2.0 * (GEOMETRY + colour) + PROJECTED), n * (600.0 + 12.0 * sh)),
+            "feature backward" => (12.0 * n * d, 6.0 * n * d),
+            // Both passes without the gradients, which they write and read, and with one reading of
+            // the parameters instead of two: 2 · 4 + 28 − 4 − 4 − 4 bytes per parameter.
+            fused_update::PASS => {
+                let parameters = n * (11.0 + 3.0 * sh);
+                (24.0 * parameters + n * PROJECTED, n * (610.0 + 12.0 * sh) + 12.0 * parameters)
             }
             "Adam" => {
-                let parameters = n * (11.0 + 3.0 * sh + d);
+                // With the fused update only the features have a pass of their own.
+                let parameters = n * (if fused { 0.0 } else { 11.0 + 3.0 * sh } + d);
                 // Parameter and two moments read and written, gradient read.
                 (28.0 * parameters, 12.0 * parameters)
             }
@@ -95,8 +105,14 @@ mod tests {
 
     #[test]
     fn pass_work_grows_with_features() {
-        let small =
-            PassWork { splats: 1e5, sh: 1.0, pixels: 3e5, intersections: 5e5, blended: 1e7, features: 0.0 };
+        let small = PassWork {
+            splats: 1e5,
+            sh: 1.0,
+            pixels: 3e5,
+            intersections: 5e5,
+            blended: 1e7,
+            ..PassWork::default()
+        };
         let more = PassWork { features: 16.0, ..small };
         for pass in ["projection", "raster forward", "raster backward", "Adam"] {
             let (a, b) = (small.of(pass).unwrap(), more.of(pass).unwrap());
@@ -106,5 +122,9 @@ mod tests {
         assert_eq!(small.of("SSIM + L1"), Some((36.0 * 3e5, 3.0 * 3e5 * 348.0)));
         assert_eq!(small.of("depth sort"), Some((64.0 * 1e5, 0.0)));
         assert_eq!(small.of("unknown"), None);
+        // Each of 14 parameters: written and read as a gradient, and read once more.
+        let [fused, back, adam] =
+            [fused_update::PASS, "projection backward", "Adam"].map(|pass| small.of(pass).unwrap().0);
+        assert_eq!(back + adam - fused, 14.0 * 12.0 * 1e5);
     }
 }

@@ -2,6 +2,7 @@
 use super::measure::{Budget, Quartiles, cores, processor_ms};
 use super::model::{PassWork, Roofline};
 use crate::gpu::{Device, Program, Recorder};
+use crate::pass::fused_update;
 use crate::{Error, Result, files};
 use serde::{Deserialize, Serialize};
 use std::fmt::Write;
@@ -283,6 +284,12 @@ impl Section {
     /// Sets bytes, operations and floors of the passes, and of the rows that consist of passes.
     pub(super) fn bound(&mut self, work: &PassWork, roofline: &Roofline) {
         let mut sums = [[0.0; 3]; 3];
+        let fused = self.row(fused_update::PASS).is_some();
+        let work = PassWork { fused, ..*work };
+        if let (true, Some((bytes, flops))) = (fused, work.of("projection backward")) {
+            // The row "forward + backward" is measured without Adam.
+            sums[1] = [bytes, flops, roofline.floor_ms(bytes, flops)];
+        }
         for row in self.rows.iter_mut().filter(|r| r.clock == Clock::Device) {
             let Some((bytes, flops)) = work.of(&row.name) else { continue };
             let floor = roofline.floor_ms(bytes, flops);

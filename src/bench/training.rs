@@ -113,10 +113,13 @@ fn measure(
         steps += 1;
         run.step(ITERATION)
     })?;
+    // Without the gradients that the separate passes below write.
+    let peak = device.memory().peak as f64 / f64::from(1 << 20);
     let allocations = (device.memory().allocations - before) as f64 / steps as f64;
     measure_forward_backward(device, run, budget, section)?;
     section.time(STEP, Clock::Wall, step);
     add_figures(device, run, roofline, section)?;
+    section.figure("peak device memory", peak, "MiB");
     section.figure("allocations per step", allocations, "");
     Ok(())
 }
@@ -129,11 +132,12 @@ fn measure_forward_backward(
     section: &mut Section,
 ) -> Result<()> {
     let p = run.trainer().step_resources();
+    let gradients = p.params.zeros_like(device)?;
     for (name, backward) in [("forward", false), ("forward + backward", true)] {
         let mut rec = Recorder::new(device, name);
         p.raster.record_forward(&mut rec, p.params, p.options);
         if backward {
-            p.raster.record_backward(&mut rec, p.params, p.options, p.gradients);
+            p.raster.record_backward(&mut rec, p.params, p.options, &gradients);
         }
         let program = rec.compile()?;
         section.time(name, Clock::Wall, budget.wall(|| Ok(program.run()?))?);
@@ -161,6 +165,7 @@ fn add_figures(
         pixels,
         intersections,
         blended,
+        ..PassWork::default()
     };
     section.bound(&work, roofline);
     section.figure("intersections", intersections, "tile–splat pairs");
@@ -170,6 +175,5 @@ fn add_figures(
     section.figure("blended per pixel", blended / pixels, "");
     section.figure("splats per second", work.splats / seconds / 1e6, "M/s");
     section.figure("intersections per second", intersections / seconds / 1e6, "M/s");
-    section.figure("peak device memory", device.memory().peak as f64 / f64::from(1 << 20), "MiB");
     Ok(())
 }

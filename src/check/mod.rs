@@ -9,7 +9,7 @@ use crate::Result;
 use crate::gpu::{Device, Options};
 use crate::pass::sort::SortAlgorithm;
 use crate::pass::ssim_l1::SsimRowKernel;
-use crate::pass::{GradientReduction, KernelVariant, TileBinning, TileSums};
+use crate::pass::{GradientReduction, KernelVariant, ShGradientKernel, TileBinning, TileSums};
 use compared::Found;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -57,6 +57,13 @@ const CASES: &[Case] = &[
     }),
     case("gradients", Some(KernelVariant::ShuffledSums), |d| render::tile_sums(d, TileSums::Shuffles)),
     case("gradients", Some(KernelVariant::SharedSums), |d| render::tile_sums(d, TileSums::Shared)),
+    case("gradients of SH", Some(KernelVariant::ShPerThread), |d| {
+        render::sh_gradients(d, ShGradientKernel::PerThread)
+    }),
+    case("gradients of SH", Some(KernelVariant::ShShared), |d| {
+        render::sh_gradients(d, ShGradientKernel::Shared)
+    }),
+    case("projection backward with Adam", Some(KernelVariant::FusedUpdate), render::update),
     case("depth and needle losses", None, render::regularisers),
     case("SSIM and L1 loss", Some(KernelVariant::SsimStrips), |d| images::ssim_l1(d, SsimRowKernel::Strips)),
     case("SSIM and L1 loss", Some(KernelVariant::SsimShared), |d| images::ssim_l1(d, SsimRowKernel::Shared)),

@@ -321,11 +321,10 @@ impl Training for Run<'_> {
             sum::record(&mut rec, loss, &self.partials, &stage.sums, stage.slot(&band) + LANGUAGE_SUM);
             stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
         }
-        stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
-        model.record_feature_step(&mut rec, &frame.status);
         if !self.options.detach_geometry {
-            model.record_step(&mut rec, &frame.status);
+            model.record_update(&mut rec, &stage.raster, raster, None);
         }
+        model.record_feature_update(&mut rec, &stage.raster, raster);
         rec.download(&frame.status);
         rec.download(&stage.sums);
         rec

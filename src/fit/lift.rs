@@ -160,7 +160,8 @@ impl Lifting<'_> {
                 codes::record(&mut rec, &targets.of(view, &band), frame, &scratch, mode);
                 stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
             }
-            stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
+            let gradients = &model.feature_gradients;
+            stage.raster.record_feature_gradients(&mut rec, &model.values, raster, gradients);
             rec.download(&frame.status);
             rec.run()?;
             match stage.raster.overflow()? {
@@ -168,7 +169,7 @@ impl Lifting<'_> {
                 None => break,
             }
         }
-        let seen = model.gradients.features.read_range(0..sums.len())?;
+        let seen = model.feature_gradients.read_range(0..sums.len())?;
         sums.iter_mut().zip(seen).for_each(|(s, v)| *s += v);
         Ok(())
     }

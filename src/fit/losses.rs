@@ -1,10 +1,9 @@
 //! Terms of the objective of the colour stage. A stage states the terms that it uses; a term that
 //! it does not name is off.
-use super::model::Model;
 use super::views::{SizeBuffers, TrainView};
 use crate::gpu::Recorder;
 use crate::pass::bands::Band;
-use crate::pass::regularise;
+use crate::pass::regularise::{self, RatioPenalty};
 use crate::pass::ssim_l1::ImageLoss;
 use crate::scene::DepthMap;
 
@@ -65,12 +64,9 @@ impl Losses {
         }
     }
 
-    /// Records the gradients by the parameters of the splats, added to those of the images.
-    pub(super) fn record_parameters(&self, rec: &mut Recorder, model: &Model) {
-        if let Some(weight) = self.needles {
-            let count = model.count();
-            let (values, gradients) = (&model.values.log_scales, &model.gradients.log_scales);
-            regularise::record_ratio(rec, values, gradients, count, weight / count as f64, RATIO_LIMIT);
-        }
+    /// Penalty on the needles among `count` splats, whose gradient the update adds to those of the
+    /// images.
+    pub(super) fn ratio_penalty(&self, count: usize) -> Option<RatioPenalty> {
+        self.needles.map(|weight| RatioPenalty { weight: weight / count as f64, limit: RATIO_LIMIT })
     }
 }

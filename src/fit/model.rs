@@ -4,7 +4,9 @@ use super::options::Rates;
 use crate::gpu::{self, Buffer, Device, Recorder};
 use crate::pass::adam::{Class, Moments, Schedule};
 use crate::pass::compact;
-use crate::pass::rasterizer::SplatBuffers;
+use crate::pass::fused_update::{ROWS, SplatAdam, UpdateKernel};
+use crate::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
+use crate::pass::regularise::{self, RatioPenalty};
 use crate::scene::Splats;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -12,11 +14,11 @@ use serde::{Deserialize, Serialize};
 /// Parameter classes, in the order of the rows of the schedule.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum ParameterClass {
-    Means,
-    LogScales,
-    Quats,
-    Opacity,
-    Sh,
+    Means = ROWS[0] as isize,
+    LogScales = ROWS[1] as isize,
+    Quats = ROWS[2] as isize,
+    Opacity = ROWS[3] as isize,
+    Sh = ROWS[4] as isize,
 }
 
 /// All classes but the features.
@@ -37,8 +39,11 @@ pub(super) struct Model {
     device: Device,
     /// Parameters that the rasteriser reads.
     pub(super) values: SplatBuffers,
-    /// Gradients that its backward pass writes.
-    pub(super) gradients: SplatBuffers,
+    /// Gradients of geometry and colour that its backward pass writes; `None` where one pass
+    /// computes and uses them.
+    gradients: Option<SplatBuffers>,
+    /// [N, d] gradients of the features.
+    pub(super) feature_gradients: Buffer<f32>,
     moments: [Moments; 5],
     feature_moments: Moments,
     schedule: Schedule,
@@ -81,7 +86,6 @@ impl Model {
     pub(super) fn new(device: &Device, splats: &Splats, feature_dim: usize) -> Result<Self> {
         let zeros = vec![0.0; splats.len() * feature_dim];
         let values = SplatBuffers::upload(device, splats, &zeros, feature_dim)?;
-        let gradients = values.zeros_like(device)?;
         let n = values.count;
         let moments = |kind| Moments::new(device, n * width(&values, kind));
         Ok(Model {
@@ -95,8 +99,9 @@ impl Model {
             feature_moments: Moments::new(device, n * feature_dim)?,
             schedule: Schedule::new(device, FEATURE_ROW + 1)?,
             device: device.clone(),
+            gradients: gradients_of(device, &values)?,
+            feature_gradients: device.buffer::<f32>("gradient features", (n * feature_dim).max(4))?,
             values,
-            gradients,
             step: 0,
         })
     }
@@ -126,8 +131,24 @@ impl Model {
         self.schedule.set(self.step, &rows)
     }
 
-    /// Records the Adam step of geometry, opacity and colour; void where `guard[1] ≠ 0`.
-    pub(super) fn record_step(&self, rec: &mut Recorder, guard: &Buffer<u32>) {
+    /// Records the backward pass from the screen-space splats of a frame to geometry, opacity and
+    /// colour, and their Adam step; void where the frame overflowed.
+    pub(super) fn record_update(
+        &self,
+        rec: &mut Recorder,
+        raster: &Rasterizer,
+        options: &RasterOptions,
+        needles: Option<RatioPenalty>,
+    ) {
+        let Some(gradients) = &self.gradients else {
+            let state = SplatAdam { moments: &self.moments, schedule: &self.schedule, needles };
+            return raster.record_update(rec, &self.values, options, &state);
+        };
+        raster.record_splat_gradients(rec, &self.values, options, gradients);
+        if let Some(needles) = needles {
+            let count = self.count();
+            regularise::record_ratio(rec, &self.values.log_scales, &gradients.log_scales, count, needles);
+        }
         for kind in GEOMETRY_AND_COLOUR {
             let w = width(&self.values, kind);
             let class = Class {
@@ -136,22 +157,30 @@ impl Model {
                 stride: w as u32,
                 head: if kind == ParameterClass::Sh { 3 } else { w as u32 },
             };
-            let (values, gradients) = (buffer(&self.values, kind), buffer(&self.gradients, kind));
-            self.schedule.record(rec, class, values, gradients, &self.moments[kind as usize], guard);
+            let (values, gradients) = (buffer(&self.values, kind), buffer(gradients, kind));
+            let (moments, guard) = (&self.moments[kind as usize], &raster.frame().status);
+            self.schedule.record(rec, class, values, gradients, moments, guard);
         }
     }
 
-    /// Records the Adam step of the raw features.
-    pub(super) fn record_feature_step(&self, rec: &mut Recorder, guard: &Buffer<u32>) {
+    /// Records the gradients of the raw features and their Adam step; void where the frame
+    /// overflowed.
+    pub(super) fn record_feature_update(
+        &self,
+        rec: &mut Recorder,
+        raster: &Rasterizer,
+        options: &RasterOptions,
+    ) {
+        raster.record_feature_gradients(rec, &self.values, options, &self.feature_gradients);
         let count = self.count() * self.values.feature_dim;
         let class = Class { slot: FEATURE_ROW as u32, count, stride: 1, head: 1 };
         self.schedule.record(
             rec,
             class,
             &self.values.features,
-            &self.gradients.features,
+            &self.feature_gradients,
             &self.feature_moments,
-            guard,
+            &raster.frame().status,
         );
     }
 
@@ -185,7 +214,8 @@ impl Model {
             moments.buffer = compact::gather(device, "adam moments", &moments.buffer, &index, n, 2 * w)?;
         }
         self.feature_moments = Moments::new(device, n * dim)?;
-        self.gradients = values.zeros_like(device)?;
+        self.gradients = gradients_of(device, &values)?;
+        self.feature_gradients = device.buffer::<f32>("gradient features", (n * dim).max(4))?;
         self.values = values;
         Ok(true)
     }
@@ -215,6 +245,16 @@ impl Model {
             "training produced numbers that are not finite ({}); nothing was kept: the cameras or points may be degenerate",
             faults.join(", ")
         )))
+    }
+}
+
+/// Buffers for the gradients of geometry and colour, where the device needs them.
+fn gradients_of(device: &Device, values: &SplatBuffers) -> Result<Option<SplatBuffers>> {
+    match UpdateKernel::of(device.info()) {
+        UpdateKernel::Fused => Ok(None),
+        UpdateKernel::Separate => {
+            SplatBuffers::zeros(device, "gradient", values.count, values.sh_degree, 0).map(Some)
+        }
     }
 }
 

@@ -378,9 +378,8 @@ impl Training for Run<'_> {
             self.options.losses.record_image(&mut rec, stage, item, &band);
             stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
         }
-        stage.raster.record_gradients(&mut rec, &model.values, raster, &model.gradients);
-        self.options.losses.record_parameters(&mut rec, model);
-        model.record_step(&mut rec, &frame.status);
+        let needles = self.options.losses.ratio_penalty(model.count());
+        model.record_update(&mut rec, &stage.raster, raster, needles);
         rec.download(&frame.status);
         rec.download(&stage.sums);
         if self.options.poses.is_some() {

@@ -15,7 +15,8 @@ pub fn open(choice: Option<&str>) -> crate::Result<Device> {
 /// Options from the environment. The device is `choice`, or else `SPLATVK_DEVICE`.
 /// `SPLATVK_VALIDATION=1` turns the validation layer on, `gpu` its GPU-assisted checks, too.
 /// `SPLATVK_STAGING=1` keeps buffers out of host-visible memory. `SPLATVK_MAX_BINDING` limits the
-/// size of a buffer, MiB. The cache is a folder of the program, where it has one.
+/// size of a buffer, MiB. `SPLATVK_DISABLE` names kernel variants to disable, separated by commas
+/// ([`crate::pass::KernelVariant::name`]). The cache is a folder of the program, where it has one.
 pub fn options(choice: Option<&str>) -> Options {
     let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
     let validation = variable("SPLATVK_VALIDATION");
@@ -28,6 +29,9 @@ pub fn options(choice: Option<&str>) -> Options {
         max_binding: variable("SPLATVK_MAX_BINDING")
             .and_then(|v| v.parse::<u64>().ok())
             .map(|mib| mib.saturating_mul(1 << 20)),
+        disabled: variable("SPLATVK_DISABLE")
+            .map(|names| names.split(',').map(|name| name.trim().to_owned()).collect())
+            .unwrap_or_default(),
         cache: FolderCache::own().map(|cache| Arc::new(cache) as Arc<dyn Cache>),
         ..Options::default()
     }

@@ -4,9 +4,9 @@ use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 
 /// β1, β2 of every 3D Gaussian splatting implementation.
-pub const BETA: [f64; 2] = [shaders::adam::BETA1, shaders::adam::BETA2];
+pub const BETA: [f64; 2] = [shaders::shared::adam::BETA1, shaders::shared::adam::BETA2];
 /// ε: tiny, since gradients are (Kerbl et al. 2023 use 1e-15).
-pub const EPSILON: f64 = shaders::adam::EPS;
+pub const EPSILON: f64 = shaders::shared::adam::EPS;
 /// Threads per workgroup in `glsl/adam.comp` and `glsl/gather.comp`.
 const GROUP: usize = shaders::adam::WORKGROUP[0] as usize;
 
@@ -48,8 +48,8 @@ pub struct Class {
 /// Rates of the current step in GPU memory, one row per class, and the count of non-finite
 /// gradients.
 pub struct Schedule {
-    rates: Buffer<f32>,
-    faults: Buffer<u32>,
+    pub(super) rates: Buffer<f32>,
+    pub(super) faults: Buffer<u32>,
     rows: Vec<[f32; 4]>,
 }
 

@@ -8,6 +8,7 @@ pub mod codes;
 pub mod compact;
 pub mod decode;
 pub mod frame;
+pub mod fused_update;
 pub mod metrics;
 pub mod options;
 pub mod pack;
@@ -33,7 +34,9 @@ pub mod variants;
 pub mod view;
 
 pub use frame::{FrameBuffers, GradientReduction, TileSums};
+pub use fused_update::UpdateKernel;
 pub use options::{FeatureMode, RasterOptions};
+pub use project_backward::ShGradientKernel;
 pub use rasterizer::{DeviceChoices, Rasterizer};
 pub use renderer::{RenderedFrame, Renderer};
 pub use splat_buffers::SplatBuffers;

@@ -14,30 +14,61 @@ use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::structs::CameraView;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
+use crate::pass::KernelVariant;
 use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
-/// Number of workgroups, each with a partial camera gradient: enough to fill a large GPU (a hundred
-/// thousand threads), or few enough to start quickly on a few cores.
-pub(super) fn groups(device: &Device, splats: usize) -> u32 {
-    let most = if device.info().is_cpu { 64 } else { 2048 };
-    splats.div_ceil(shaders::project_backward::WORKGROUP[0] as usize).clamp(1, most) as u32
+/// Kernel that writes the gradients by the SH coefficients.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ShGradientKernel {
+    /// Each thread writes those of its splat, for CPU devices.
+    PerThread,
+    /// A workgroup writes those of its splats in the order of memory, for GPUs.
+    Shared,
+}
+
+impl ShGradientKernel {
+    /// The faster kernel for the device, unless it is disabled.
+    pub fn of(device: &Device) -> ShGradientKernel {
+        let info = device.info();
+        match (if info.is_cpu { KernelVariant::ShPerThread } else { KernelVariant::ShShared })
+            .or_replacement(info)
+        {
+            KernelVariant::ShPerThread => ShGradientKernel::PerThread,
+            _ => ShGradientKernel::Shared,
+        }
+    }
+}
+
+/// Largest number of workgroups, each with a partial camera gradient: some times as many as a large
+/// GPU runs at once (132 processors with 8 to 16 each), so that the last of them end together, or
+/// few enough to start quickly on a few cores.
+pub(super) fn most_groups(device: &Device) -> u32 {
+    if device.info().is_cpu { 64 } else { 8192 }
+}
+
+/// Number of workgroups for this many splats.
+pub(super) fn groups(splats: usize, most: u32) -> u32 {
+    splats.div_ceil(shaders::project_backward::WORKGROUP[0] as usize).clamp(1, most.max(1) as usize) as u32
 }
 
 /// Records the gradients by all raw parameters (overwrites `gradients`; zero for splats without
-/// pixels) and by the camera (`camera_grad` [10]: ρ, θ, fx, fy, cx, cy).
+/// pixels) and by the camera (`frame.camera_grad`).
 pub fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,
     camera: &Buffer<CameraView>,
     frame: &FrameBuffers,
     sh_degree: u32,
+    (kernel, most_groups): (ShGradientKernel, u32),
     gradients: &SplatBuffers,
-    camera_grad: &Buffer<f32>,
 ) {
     let count = splats.count as u32;
     let call = shaders::project_backward::call(
-        shaders::project_backward::Variant { sh_degree },
+        shaders::project_backward::Variant {
+            sh_degree,
+            shared_sh: u32::from(kernel == ShGradientKernel::Shared),
+        },
         &shaders::project_backward::Bindings {
             camera,
             means: &splats.means,
@@ -59,11 +90,15 @@ pub fn record(
             antialiased: splats.antialiased.into(),
         },
     );
-    let groups = groups(rec.device(), splats.count);
-    rec.dispatch(call, [groups, 1, 1]);
+    rec.dispatch(call, [groups(splats.count, most_groups), 1, 1]);
+    record_camera(rec, frame, groups(splats.count, most_groups));
+}
+
+/// Records the sum of the camera gradients of `parts` workgroups.
+pub(super) fn record_camera(rec: &mut Recorder, frame: &FrameBuffers, parts: u32) {
     let call = shaders::camera_sum::call(
-        &shaders::camera_sum::Bindings { camera_parts: &frame.camera_parts, camera_grad },
-        &shaders::camera_sum::Push { parts: groups },
+        &shaders::camera_sum::Bindings { camera_parts: &frame.camera_parts, camera_grad: &frame.camera_grad },
+        &shaders::camera_sum::Push { parts },
     );
     rec.dispatch(call, [CAMERA_GRADIENTS as u32, 1, 1]);
 }
@@ -74,7 +109,7 @@ pub fn record_features(
     splats: &SplatBuffers,
     frame: &FrameBuffers,
     mode: FeatureMode,
-    gradients: &SplatBuffers,
+    features_grad: &Buffer<f32>,
 ) {
     if splats.feature_dim == 0 {
         return;
@@ -84,7 +119,7 @@ pub fn record_features(
         &shaders::features_backward::Bindings {
             features: &splats.features,
             codes_grad: &frame.codes_grad,
-            features_grad: &gradients.features,
+            features_grad,
         },
         &shaders::features_backward::Push {
             count,

@@ -44,6 +44,8 @@ use super::frame::{
     CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, GradientReduction, PROJECTED_FLOATS, TileSums,
     Tiles, entry_bytes,
 };
+use super::fused_update::{self, SplatAdam};
+use super::project_backward::ShGradientKernel;
 use super::sort::Sort;
 use super::tile_lists::{self, LONGEST_LIST, TILE, TileBinning, TileLists};
 use super::view::View;
@@ -66,6 +68,10 @@ pub struct DeviceChoices {
     pub summation: GradientReduction,
     /// Reduction of the gradients over the pixels of a tile.
     pub tile_sums: TileSums,
+    /// Writing of the gradients by the SH coefficients.
+    pub sh_gradients: ShGradientKernel,
+    /// Most workgroups of the backward pass of the projection.
+    pub projection_groups: u32,
 }
 
 impl DeviceChoices {
@@ -75,6 +81,8 @@ impl DeviceChoices {
             grouping: TileBinning::of(device),
             summation: GradientReduction::of(device),
             tile_sums: TileSums::of(device),
+            sh_gradients: ShGradientKernel::of(device),
+            projection_groups: project_backward::most_groups(device),
         }
     }
 }
@@ -101,6 +109,8 @@ pub struct Rasterizer {
     camera: Buffer<CameraView>,
     frame: FrameBuffers,
     grouping: TileBinning,
+    sh_gradients: ShGradientKernel,
+    projection_groups: u32,
     /// Rows of tiles that are binned at once.
     strip: u32,
     sort: Sort,
@@ -160,7 +170,7 @@ impl Rasterizer {
             projected_grad: device.buffer::<f32>("projected_grad", GRADIENT_FLOATS * splats)?,
             camera_parts: device.buffer::<f32>(
                 "camera_parts",
-                CAMERA_GRADIENTS * project_backward::groups(device, splats) as usize,
+                CAMERA_GRADIENTS * project_backward::groups(splats, choices.projection_groups) as usize,
             )?,
             summation: choices.summation,
             tile_sums: choices.tile_sums,
@@ -179,6 +189,8 @@ impl Rasterizer {
             camera,
             frame,
             grouping: choices.grouping,
+            sh_gradients: choices.sh_gradients,
+            projection_groups: choices.projection_groups,
             strip,
             sort,
             count,
@@ -306,11 +318,55 @@ impl Rasterizer {
         options: &RasterOptions,
         gradients: &SplatBuffers,
     ) {
+        self.record_splat_gradients(rec, params, options, gradients);
+        self.record_feature_gradients(rec, params, options, &gradients.features);
+    }
+
+    /// Records the part of [`Rasterizer::record_gradients`] for all parameters but the features.
+    pub fn record_splat_gradients(
+        &self,
+        rec: &mut Recorder,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        gradients: &SplatBuffers,
+    ) {
         let sh_degree = options.sh_degree.min(params.sh_degree);
         rec.pass("projection backward");
-        let camera_grad = &self.frame.camera_grad;
-        project_backward::record(rec, params, &self.camera, &self.frame, sh_degree, gradients, camera_grad);
-        project_backward::record_features(rec, params, &self.frame, options.feature_mode, gradients);
+        let kernel = (self.sh_gradients, self.projection_groups);
+        project_backward::record(rec, params, &self.camera, &self.frame, sh_degree, kernel, gradients);
+    }
+
+    /// Records the part of [`Rasterizer::record_gradients`] for the features; nothing without
+    /// features.
+    pub fn record_feature_gradients(
+        &self,
+        rec: &mut Recorder,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        features_grad: &Buffer<f32>,
+    ) {
+        rec.pass("feature backward");
+        project_backward::record_features(rec, params, &self.frame, options.feature_mode, features_grad);
+    }
+
+    /// Records the backward pass from the screen-space splats to Adam's step of all parameters but
+    /// the features, and to `frame().camera_grad`; the step is void where `frame().status[1] ≠ 0`.
+    /// Needs the results of a forward pass with all stored SH coefficients.
+    pub fn record_update(
+        &self,
+        rec: &mut Recorder,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        state: &SplatAdam,
+    ) {
+        if options.sh_degree < params.sh_degree {
+            let (used, stored) = (options.sh_degree, params.sh_degree);
+            rec.fail(format!(
+                "the update of SH degree {stored} was asked for after a render of degree {used}"
+            ));
+        }
+        rec.pass(fused_update::PASS);
+        fused_update::record(rec, params, &self.camera, &self.frame, self.projection_groups, state);
     }
 
     fn record_lists(&self, rec: &mut Recorder, params: &SplatBuffers, tiles: &Tiles) {

@@ -69,19 +69,31 @@ pub fn alpha_l1(alpha: &[f64], wanted: &[f64], weight: f64) -> (f64, Vec<f64>) {
     (loss, pairs().map(slope).collect())
 }
 
+/// Penalty on needles `weight · Σ max(0, s_max/s_min − limit)`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RatioPenalty {
+    /// Weight per splat.
+    pub weight: f64,
+    /// Ratio of the axes up to which a splat is no needle.
+    pub limit: f32,
+}
+
 /// Records `gradients += ∂/∂log_scales (weight · Σ max(0, s_max/s_min − limit))`, both [N, 3].
 pub fn record_ratio(
     rec: &mut Recorder,
     log_scales: &Buffer<f32>,
     gradients: &Buffer<f32>,
     count: usize,
-    weight: f64,
-    limit: f32,
+    penalty: RatioPenalty,
 ) {
     rec.pass("regularisers");
     let call = shaders::ratio_penalty::call(
         &shaders::ratio_penalty::Bindings { log_scales, gradients },
-        &shaders::ratio_penalty::Push { count: count as u32, weight: weight as f32, limit },
+        &shaders::ratio_penalty::Push {
+            count: count as u32,
+            weight: penalty.weight as f32,
+            limit: penalty.limit,
+        },
     );
     rec.dispatch_threads(call, [count as u32, 1, 1]);
 }
@@ -116,7 +128,8 @@ mod tests {
         let log_scales = device.buffer_from("log scales", rows.as_flattened()).unwrap();
         let gradients = device.buffer_from("gradients", &[1.0f32; 3 * 97]).unwrap();
         let mut rec = Recorder::new(&device, "ratio");
-        record_ratio(&mut rec, &log_scales, &gradients, 97, 0.5, 8.0);
+        let penalty = RatioPenalty { weight: 0.5, limit: 8.0 };
+        record_ratio(&mut rec, &log_scales, &gradients, 97, penalty);
         rec.run().unwrap();
         let mut active = 0;
         for (row, got) in rows.iter().zip(gradients.read().unwrap().chunks_exact(3)) {
@@ -144,7 +157,8 @@ mod tests {
         let log_scales = device.buffer_from("log scales", &[45.0f32, 0.0, -45.0]).unwrap();
         let gradients = device.buffer::<f32>("gradients", 3).unwrap();
         let mut rec = Recorder::new(&device, "degenerate");
-        record_ratio(&mut rec, &log_scales, &gradients, 1, 0.5, 8.0);
+        let penalty = RatioPenalty { weight: 0.5, limit: 8.0 };
+        record_ratio(&mut rec, &log_scales, &gradients, 1, penalty);
         rec.run().unwrap();
         let got = gradients.read().unwrap();
         let capped = 0.5 * 10f32.exp();

@@ -27,11 +27,22 @@ pub enum KernelVariant {
     SsimStrips,
     /// SSIM with a span of a row per workgroup ([`crate::pass::ssim_l1::SsimRowKernel::Shared`]).
     SsimShared,
+    /// SH gradients written by the thread of their splat
+    /// ([`crate::pass::ShGradientKernel::PerThread`]).
+    ShPerThread,
+    /// SH gradients written by a workgroup in the order of memory
+    /// ([`crate::pass::ShGradientKernel::Shared`]).
+    ShShared,
+    /// Gradients of the parameters in memory between the backward pass of the projection and Adam
+    /// ([`crate::pass::UpdateKernel::Separate`]).
+    SeparateUpdate,
+    /// Both in one pass ([`crate::pass::UpdateKernel::Fused`]).
+    FusedUpdate,
 }
 
 impl KernelVariant {
     /// All of them.
-    pub const ALL: [KernelVariant; 11] = [
+    pub const ALL: [KernelVariant; 15] = [
         KernelVariant::FloatAtomics,
         KernelVariant::AtomicGradients,
         KernelVariant::StoredGradients,
@@ -43,6 +54,10 @@ impl KernelVariant {
         KernelVariant::SortedLists,
         KernelVariant::SsimStrips,
         KernelVariant::SsimShared,
+        KernelVariant::ShPerThread,
+        KernelVariant::ShShared,
+        KernelVariant::SeparateUpdate,
+        KernelVariant::FusedUpdate,
     ];
 
     /// The name that `splatvk doctor` prints and [`crate::gpu::Options::disabled`] takes.
@@ -59,6 +74,10 @@ impl KernelVariant {
             KernelVariant::SortedLists => "tile lists by sorting",
             KernelVariant::SsimStrips => "rows in strips",
             KernelVariant::SsimShared => "rows in shared memory",
+            KernelVariant::ShPerThread => "SH gradients per thread",
+            KernelVariant::ShShared => "SH gradients in shared memory",
+            KernelVariant::SeparateUpdate => "update in two passes",
+            KernelVariant::FusedUpdate => "update in one pass",
         }
     }
 
@@ -76,6 +95,10 @@ impl KernelVariant {
             KernelVariant::SortedLists => KernelVariant::CountedLists,
             KernelVariant::SsimStrips => KernelVariant::SsimShared,
             KernelVariant::SsimShared => KernelVariant::SsimStrips,
+            KernelVariant::ShPerThread => KernelVariant::ShShared,
+            KernelVariant::ShShared => KernelVariant::ShPerThread,
+            KernelVariant::SeparateUpdate => KernelVariant::FusedUpdate,
+            KernelVariant::FusedUpdate => KernelVariant::SeparateUpdate,
         }
     }
 
@@ -93,7 +116,7 @@ mod tests {
     use crate::gpu::{Options, TestDevice, options, test_device};
     use crate::pass::sort::SortAlgorithm;
     use crate::pass::ssim_l1::SsimRowKernel;
-    use crate::pass::{GradientReduction, TileBinning, TileSums};
+    use crate::pass::{GradientReduction, ShGradientKernel, TileBinning, TileSums};
 
     #[test]
     fn disabled_variants_are_replaced() {
@@ -121,5 +144,7 @@ mod tests {
         assert_eq!(GradientReduction::of(&device), GradientReduction::Entries);
         assert_eq!(TileBinning::of(&device), TileBinning::Sorting);
         assert_eq!(device.info().float_atomics, usual.info().float_atomics);
+        let other = if usual.info().is_cpu { KernelVariant::ShPerThread } else { KernelVariant::ShShared };
+        assert_ne!(ShGradientKernel::of(&without(&[other])), ShGradientKernel::of(&usual));
     }
 }

@@ -6,6 +6,7 @@
 //! measured (docs/internals/performance.md).
 use crate::fit::{Preset, RgbOptions};
 use crate::gpu::DeviceInfo;
+use crate::pass::UpdateKernel;
 use crate::pass::bands::{Bands, widest};
 use crate::pass::plane_sweep::MAX_SOURCES;
 use crate::pass::raster_forward::BASE_CHANNELS;
@@ -143,8 +144,10 @@ fn training_bytes(
     }
     // Photo, depth, and a label per level.
     bytes += sizes.iter().map(pixels).sum::<u64>() * (12 + if features > 0 { 12 } else { 4 });
-    // Value, gradient and two moments of each parameter, at SH degree 0.
-    Ok(bytes + splats * 16 * (14 + features as u64))
+    // Value, gradient and two moments of each parameter, at SH degree 0; the fused update stores no
+    // gradients but those of the features.
+    let geometry = if UpdateKernel::of(device) == UpdateKernel::Fused { 12 * 14 } else { 16 * 14 };
+    Ok(bytes + splats * (geometry + 16 * features as u64))
 }
 
 /// Reason why photos of these sizes do not fit, or `None`.

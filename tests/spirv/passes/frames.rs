@@ -1,13 +1,15 @@
 //! Rendering forward and backward, and passes that read a rendered frame.
 use crate::support::{
-    IMAGE, Scene, assert_class, assert_close, assert_gradients, assert_images, assert_lists, in_bands,
-    rendered,
+    IMAGE, Scene, assert_class, assert_close, assert_gradients, assert_images, assert_lists, assert_update,
+    in_bands, rendered,
 };
 use splatvk::gpu::{Device, Recorder};
 use splatvk::math::Random;
 use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
 use splatvk::pass::raster_forward::{Cutoffs, ReferenceScene, walk};
-use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, Rasterizer, TileSums};
+use splatvk::pass::{
+    DeviceChoices, FeatureMode, GradientReduction, Rasterizer, ShGradientKernel, TileSums,
+};
 use splatvk::pass::{decode as decoding, pack as packing, pairs as counting};
 use splatvk::scene::seeded;
 
@@ -128,6 +130,39 @@ pub fn gradients_by_entry(device: &Device) {
     for (n, sh_degree, dim) in [(40, 2, 0), (20, 1, 3), (20, 3, 8), (15, 0, 16), (12, 0, 37)] {
         let scene = scene(n, sh_degree, dim, 1043 + dim as u64);
         check_both_directions(device, &scene, ways);
+    }
+}
+
+/// Workgroups that take two turns; all degrees, and a degree below that of the coefficients.
+fn gradients_in_turns(device: &Device, sh_gradients: ShGradientKernel) {
+    let ways = DeviceChoices { sh_gradients, projection_groups: 1, ..DeviceChoices::of(device) };
+    for sh_degree in [0, 1, 2, 3] {
+        let mut scene = scene(70, sh_degree, 0, 1046);
+        let upstream = scene.upstream(7);
+        assert_gradients(&scene, &scene.gradients_by(device, ways, &upstream), 7);
+        if sh_degree == 3 {
+            scene.options.sh_degree = 1;
+            let gradients = scene.gradients_by(device, ways, &upstream);
+            let unused = |row: &[f32]| row[12..].iter().all(|v| *v == 0.0);
+            assert!(gradients.splats.sh.chunks_exact(48).all(unused), "unused coefficients");
+        }
+    }
+}
+
+pub fn sh_per_thread(device: &Device) {
+    gradients_in_turns(device, ShGradientKernel::PerThread);
+}
+
+pub fn sh_shared(device: &Device) {
+    gradients_in_turns(device, ShGradientKernel::Shared);
+}
+
+/// Gradients and Adam in one pass: workgroups that take two turns, all degrees, and last vectors
+/// with one, two and four numbers.
+pub fn fused_update(device: &Device) {
+    let ways = DeviceChoices { projection_groups: 1, ..DeviceChoices::of(device) };
+    for (n, sh_degree) in [(70, 0), (69, 1), (67, 2), (68, 3)] {
+        assert_update(device, &scene(n, sh_degree, 0, 1054), ways);
     }
 }
 

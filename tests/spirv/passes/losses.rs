@@ -6,7 +6,7 @@ use splatvk::pass::adam::{self as optimiser, Class, Moments, Schedule};
 use splatvk::pass::bands::Bands;
 use splatvk::pass::codes::{self as language, Mode, Targets};
 use splatvk::pass::regularise::{
-    alpha_l1, depth_l1, ratio_penalty, record_alpha, record_depth, record_ratio,
+    RatioPenalty, alpha_l1, depth_l1, ratio_penalty, record_alpha, record_depth, record_ratio,
 };
 use splatvk::pass::ssim_l1::{self as image_loss, SsimRowKernel};
 
@@ -67,7 +67,7 @@ pub fn ratio(device: &Device) {
     let log_scales = device.buffer_from("log scales", &rows).unwrap();
     let gradients = device.buffer_from("gradients", &[1.0f32; 3 * 97]).unwrap();
     let mut rec = Recorder::new(device, "ratio");
-    record_ratio(&mut rec, &log_scales, &gradients, 97, 0.5, 8.0);
+    record_ratio(&mut rec, &log_scales, &gradients, 97, RatioPenalty { weight: 0.5, limit: 8.0 });
     rec.run().unwrap();
     for (row, got) in rows.chunks_exact(3).zip(gradients.read().unwrap().chunks_exact(3)) {
         let (_, gradient) = ratio_penalty([0, 1, 2].map(|k| f64::from(row[k])), 0.5, 8.0);
