@@ -1,21 +1,14 @@
 #version 450
-// variants: GROUPING=0,1
-// Writes the entries: for every splat in depth order its tiles, row by row. All lanes write the
+// Grouping by counting: writes the entries, for every splat in depth order its tiles, row by row. All lanes write the
 // same number of entries, so many lanes share a splat that covers the screen. If the entries do not
 // fit, none is written and the status holds the number needed: the image then has no splats at all,
 // never a few missing. Reference: pass::bin.
 //
 // Rows of tiles from first_row up to end_row of the image are binned; tile 0 is the first of these.
 //
-// GROUPING 0 (counting, see bin_scatter.comp): entries are (tile, splat), and the lane counts them
-// per tile. GROUPING 1 (sorting, see bin_ranges.comp): entries are (tile, own index), and
-// `entry_splats` holds the splat.
+// The lane counts its entries per tile, see bin_scatter.comp.
 #extension GL_GOOGLE_include_directive : require
-#if GROUPING == 0
 layout(local_size_x = 8) in;
-#else
-layout(local_size_x = 64) in;
-#endif
 
 layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };  // [N, 3]
 // [N] (key, splat), sorted.
@@ -25,12 +18,8 @@ layout(std430, binding = 2) readonly buffer Starts { uint starts[]; };
 layout(std430, binding = 3) buffer Status { uint status[]; };  // [3] see FrameBuffers
 // Entries, 0 if they do not fit.
 layout(std430, binding = 4) writeonly buffer EntryCount { uint entry_count; };
-layout(std430, binding = 5) writeonly buffer Entries { uvec2 entries[]; };  // [capacity]
-#if GROUPING == 0
+layout(std430, binding = 5) writeonly buffer Entries { uvec2 entries[]; };  // [capacity] (tile, splat)
 layout(std430, binding = 6) buffer Counters { uint counters[]; };  // [tiles, lanes]
-#else
-layout(std430, binding = 7) writeonly buffer EntrySplats { uint entry_splats[]; };  // [capacity]
-#endif
 layout(push_constant) uniform Push {
     uint count; uint tiles_x; uint first_row; uint end_row; uint lanes; uint capacity;
 };
@@ -84,13 +73,8 @@ void main() {
         }
         if (x <= last) {
             uint tile = (uint(row) - first_row) * tiles_x + uint(x);
-#if GROUPING == 0
             entries[entry] = uvec2(tile, splat);
             counters[tile * lanes + lane]++;
-#else
-            entries[entry] = uvec2(tile, entry);
-            entry_splats[entry] = splat;
-#endif
             entry++;
         }
     }

@@ -1,7 +1,8 @@
 #version 450
 // variants: SH_DEGREE=0,1,2,3
 // Projects splats to the screen and writes their depth sort keys. Equations and reference:
-// pass::project.
+// pass::project. Also clears the counters of the sort and of the tile lists that follow: a fill of
+// each would be a command of its own.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
@@ -16,7 +17,12 @@ layout(std430, binding = 5) readonly buffer Sh { float sh[]; };  // [N, sh_strid
 layout(std430, binding = 6) writeonly buffer Projected { vec4 projected[]; };
 // [N] (sort key, splat).
 layout(std430, binding = 7) writeonly buffer DepthPairs { uvec2 depth_pairs[]; };
-layout(push_constant) uniform Push { uint count; uint sh_stride; uint antialiased; };
+layout(std430, binding = 8) writeonly buffer SplatCount { uint splat_count; };     // N
+layout(std430, binding = 9) writeonly buffer SortZeros { uint sort_zeros[]; };     // [sort_words]
+layout(std430, binding = 10) writeonly buffer ListZeros { uint list_zeros[]; };    // [list_words]
+layout(push_constant) uniform Push {
+    uint count; uint sh_stride; uint antialiased; uint sort_words; uint list_words;
+};
 
 #include "shared/camera.glsl"
 #include "shared/cutoffs.glsl"
@@ -27,7 +33,10 @@ layout(push_constant) uniform Push { uint count; uint sh_stride; uint antialiase
 const float LOG2_E = 1.4426950408889634;
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = gl_GlobalInvocationID.x, threads = 64u * gl_NumWorkGroups.x;
+    if (i == 0u) splat_count = count;
+    for (uint k = i; k < sort_words; k += threads) sort_zeros[k] = 0u;
+    for (uint k = i; k < list_words; k += threads) list_zeros[k] = 0u;
     if (i >= count) return;
     vec3 mean = vec3(means[3 * i], means[3 * i + 1], means[3 * i + 2]);
     Geometry g = geometry_of(mean, vec3(log_scales[3 * i], log_scales[3 * i + 1], log_scales[3 * i + 2]), quats[i]);

@@ -1,13 +1,16 @@
 #version 450
-// OneSweep radix sort, step 1 of 3: digit histograms of all passes, in one read of the keys.
+// OneSweep radix sort, step 1 of 2: digit histograms of all passes, in one read of the keys.
+#extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 256) in;
 
 layout(std430, binding = 0) readonly buffer Pairs { uvec2 pairs[]; };   // [N] (key, value)
 layout(std430, binding = 1) readonly buffer Count { uint count; };      // N
-layout(std430, binding = 2) buffer Digits { uint digits[]; };           // [4, 256], zero at first
-layout(push_constant) uniform Push { uint mask; uint passes; };
+// From first_digit on [4, 256], zero at first.
+layout(std430, binding = 2) buffer Zeros { uint zeros[]; };
+// rounds: pairs per thread, a multiple of BLOCK.
+layout(push_constant) uniform Push { uint mask; uint passes; uint first_digit; uint rounds; };
 
-const uint PAIRS_PER_THREAD = 32; // so many that the 1024 sums at the end cost little
+const uint BLOCK = 4; // loads in flight at once
 
 shared uint counters[4 * 256];
 
@@ -16,18 +19,23 @@ void main() {
     for (uint pass = 0u; pass < passes; pass++) counters[pass * 256u + thread] = 0u;
     barrier();
     uint group = gl_WorkGroupID.y * gl_NumWorkGroups.x + gl_WorkGroupID.x;
-    for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
-        uint index = (group * PAIRS_PER_THREAD + i) * 256u + thread;
-        if (index < count) {
-            uint key = pairs[index].x & mask;
-            for (uint pass = 0u; pass < passes; pass++) {
-                atomicAdd(counters[pass * 256u + ((key >> (8u * pass)) & 255u)], 1u);
+    for (uint i = 0u; i < rounds; i += BLOCK) {
+        uint first = (group * rounds + i) * 256u + thread;
+        uint keys[BLOCK];
+        [[unroll]] for (uint k = 0u; k < BLOCK; k++) {
+            keys[k] = first + k * 256u < count ? pairs[first + k * 256u].x & mask : 0u;
+        }
+        [[unroll]] for (uint k = 0u; k < BLOCK; k++) {
+            if (first + k * 256u < count) {
+                for (uint pass = 0u; pass < passes; pass++) {
+                    atomicAdd(counters[pass * 256u + ((keys[k] >> (8u * pass)) & 255u)], 1u);
+                }
             }
         }
     }
     barrier();
     for (uint pass = 0u; pass < passes; pass++) {
         uint sum = counters[pass * 256u + thread];
-        if (sum > 0u) atomicAdd(digits[pass * 256u + thread], sum);
+        if (sum > 0u) atomicAdd(zeros[first_digit + pass * 256u + thread], sum);
     }
 }

@@ -1,6 +1,6 @@
 #version 450
 // subgroups: 4,8,16,32,64
-// OneSweep radix sort, step 3 of 3, once per digit place (Adinets and Merrill 2022, "Onesweep: A
+// OneSweep radix sort, step 2 of 2, once per digit place (Adinets and Merrill 2022, "Onesweep: A
 // Faster Least Significant Digit Radix Sort for GPUs"). Each workgroup ranks one partition tile,
 // publishes its aggregate (count) of every digit, finds the exclusive prefix of every digit over
 // all preceding tiles by decoupled look-back, publishes the inclusive prefix, and scatters its
@@ -10,39 +10,43 @@
 // or done. Vulkan does not guarantee forward progress between workgroups, however: a running
 // predecessor may stand still while this workgroup spins. After MAX_SPINS failed polls the
 // workgroup therefore counts the digit of a predecessor itself.
+#extension GL_GOOGLE_include_directive : require
+#extension GL_EXT_control_flow_attributes : require
 #extension GL_KHR_shader_subgroup_basic : require
+#extension GL_KHR_shader_subgroup_arithmetic : require
 #extension GL_KHR_shader_subgroup_ballot : require
 #extension GL_KHR_shader_subgroup_shuffle : require
 layout(local_size_x = 8 * SUBGROUP_SIZE) in;
 
 layout(std430, binding = 0) readonly buffer Pairs { uvec2 pairs[]; };         // [N] (key, value)
 layout(std430, binding = 1) readonly buffer Count { uint count; };            // N
-layout(std430, binding = 2) readonly buffer Digits { uint digit_bases[]; };   // [passes, 256]
-// [passes, stride], zero at first: the next tile number, then the status of each (tile, digit).
-layout(std430, binding = 3) buffer Tiles { uint tile_status[]; };
-layout(std430, binding = 4) writeonly buffer Sorted { uvec2 sorted[]; };      // [N]
-layout(push_constant) uniform Push { uint pass; uint mask; uint stride; };
+// From first_digit on: [4, 256] counts of the digits, and for each pass [stride], zero at first: the
+// next tile number, then the status of each (tile, digit).
+layout(std430, binding = 2) buffer Zeros { uint zeros[]; };
+layout(std430, binding = 3) writeonly buffer Sorted { uvec2 sorted[]; };      // [N]
+layout(push_constant) uniform Push { uint pass; uint mask; uint first_digit; uint stride; };
+
+#include "shared/ballot.glsl"
+#include "shared/look_back.glsl"
 
 const uint SUBGROUPS = 8;
 const uint THREADS = SUBGROUPS * SUBGROUP_SIZE;
 const uint TILE = 2048;
 const uint PAIRS_PER_THREAD = TILE / THREADS;
-// Status of a (tile, digit): a flag and a count. The count is the aggregate of the tile, or the
-// inclusive prefix over the tile and all preceding ones; 0 = not published yet.
-const uint FLAG_AGGREGATE = 1u << 30, FLAG_INCLUSIVE = 2u << 30, COUNT_MASK = FLAG_AGGREGATE - 1u;
-
-// Failed polls per digit before the predecessor is counted here. A tile takes some microseconds and
-// a poll a fraction of one, so no GPU reaches this number. Lavapipe leaves the loops of a shader
-// after 65535 rounds in all, which happened where the system had suspended the thread of the
-// predecessor.
-const uint MAX_SPINS = 1000u;
+const uint DIGITS_PER_THREAD = (255u + THREADS) / THREADS;
+// Predecessors that a thread polls at once, since one poll after the other would wait for memory
+// each time. Tiles that all run at once publish their aggregates at about the same time, so that
+// one must look at many; of more tiles, many have their prefix soon, and polls are atomic accesses.
+const uint MOST_POLLS = 16, POLLS = 4;
+const uint FEW_TILES = 128; // about the number of multiprocessors of a large GPU
 
 shared uint next_tile;
 shared uint counters[SUBGROUPS * 256]; // per subgroup and digit: counts, then offsets in the tile
-shared uint aggregates[256];
-shared uint sums[2][256];
+shared uvec2 chunk_sums[256 / SUBGROUP_SIZE]; // counts of SUBGROUP_SIZE digits, here and everywhere
 shared uint offsets[256];              // position in `sorted` minus position in the tile
 shared uvec2 staged[TILE];
+
+uint digit_of(uint key) { return ((key & mask) >> (8u * pass)) & 255u; }
 
 // Aggregate of one digit of a preceding tile, which is always full.
 uint count_digit(uint tile, uint digit) {
@@ -57,105 +61,129 @@ uint count_digit(uint tile, uint digit) {
     return n;
 }
 
+// Count of a digit in all tiles before `tile`; `statuses` is the index of that of the first tile.
+uint look_back(uint statuses, uint tile, uint digit, uint polls) {
+    uint sum = 0u, end = tile, spins = 0u; // `sum` has the tiles from `end` on
+    bool done = end == 0u;
+    while (!done) {
+        uint seen[MOST_POLLS];
+        [[unroll]] for (uint k = 0u; k < MOST_POLLS; k++) {
+            seen[k] = k < end ? 0u : FLAG_INCLUSIVE; // not seen, or before the first tile
+            if (k < min(end, polls)) seen[k] = atomicOr(zeros[statuses + (end - 1u - k) * 256u + digit], 0u);
+        }
+        uint used = 0u;
+        bool published = true;
+        [[unroll]] for (uint k = 0u; k < MOST_POLLS; k++) {
+            published = published && seen[k] != 0u;
+            if (published && !done) {
+                sum += seen[k] & COUNT_MASK;
+                used++;
+                done = (seen[k] & FLAG_INCLUSIVE) != 0u;
+            }
+        }
+        spins = used > 0u ? 0u : spins + 1u;
+        if (spins > MAX_SPINS) {
+            sum += count_digit(end - 1u, digit);
+            used = 1u;
+            spins = 0u;
+        }
+        end -= min(used, end);
+        done = done || end == 0u;
+    }
+    return sum;
+}
+
 void main() {
-    uint thread = gl_LocalInvocationID.x;
     uint lane = gl_SubgroupInvocationID;
     uint subgroup = gl_SubgroupID; // a device may assign threads to subgroups in any order
-    uint status_base = pass * stride + 1u;
-    if (thread == 0u) next_tile = atomicAdd(tile_status[status_base - 1u], 1u);
+    uint thread = subgroup * SUBGROUP_SIZE + lane;
+    uint next = first_digit + 1024u + pass * stride, statuses = first_digit + 1024u + pass * stride + 1u;
+    if (gl_LocalInvocationID.x == 0u) next_tile = atomicAdd(zeros[next], 1u);
     for (uint i = thread; i < SUBGROUPS * 256u; i += THREADS) counters[i] = 0u;
+    // Read while the tile number is on its way.
+    uint end = count;
+    uint everywhere[DIGITS_PER_THREAD];
+    for (uint k = 0u; k < DIGITS_PER_THREAD; k++) {
+        everywhere[k] = zeros[first_digit + pass * 256u + min(k * THREADS + thread, 255u)];
+    }
+    uint polls = end <= FEW_TILES * TILE ? MOST_POLLS : POLLS;
     barrier();
     uint tile = next_tile;
     uint first = tile * TILE;
+    if (first >= end) return;
 
     // Ranks among the pairs of the subgroup with the same digit, in order of index. Pairs beyond
     // the end get the last digit: they are last in order and displace no other pair.
     uvec2 own[PAIRS_PER_THREAD];
     uint ranks[PAIRS_PER_THREAD];
-    // A shift by 32 is undefined, so whole words are special cases.
-    uvec2 all = uvec2(SUBGROUP_SIZE < 32 ? (1u << (SUBGROUP_SIZE % 32)) - 1u : ~0u, SUBGROUP_SIZE < 64 ? 0u : ~0u);
-    uvec2 before = lane < 32u ? uvec2((1u << lane) - 1u, 0u) : uvec2(~0u, (1u << (lane - 32u)) - 1u);
     for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
         uint index = first + (subgroup * PAIRS_PER_THREAD + i) * SUBGROUP_SIZE + lane;
-        own[i] = index < count ? pairs[index] : uvec2(~0u);
-        uint digit = index < count ? ((own[i].x & mask) >> (8u * pass)) & 255u : 255u;
-        uvec2 peers = all;
-        for (uint bit = 0u; bit < 8u; bit++) {
+        own[i] = index < end ? pairs[index] : uvec2(~0u);
+    }
+    for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
+        uint index = first + (subgroup * PAIRS_PER_THREAD + i) * SUBGROUP_SIZE + lane;
+        uint digit = index < end ? digit_of(own[i].x) : 255u;
+        LaneSet peers = all_lanes();
+        [[unroll]] for (uint bit = 0u; bit < 8u; bit++) {
             bool set = ((digit >> bit) & 1u) != 0u;
-            uvec2 setters = subgroupBallot(set).xy;
+            LaneSet setters = lanes_where(set);
             peers &= set ? setters : ~setters;
         }
-        uint rank = bitCount(peers.x & before.x) + bitCount(peers.y & before.y);
+        uint rank = size_of(peers & lanes_before(lane));
         uint earlier = 0u;
-        if (rank == 0u) earlier = atomicAdd(counters[subgroup * 256u + digit], bitCount(peers.x) + bitCount(peers.y));
-        uint leader = peers.x != 0u ? findLSB(peers.x) : 32u + findLSB(peers.y);
-        ranks[i] = subgroupShuffle(earlier, leader) + rank;
+        if (rank == 0u) earlier = atomicAdd(counters[subgroup * 256u + digit], size_of(peers));
+        ranks[i] = subgroupShuffle(earlier, lowest(peers)) + rank;
     }
     barrier();
 
     // Publishes the aggregates as early as possible, then scans the counts over subgroups and
-    // digits.
-    for (uint digit = thread; digit < 256u; digit += THREADS) {
-        uint total = 0u;
-        for (uint s = 0u; s < SUBGROUPS; s++) {
-            uint here = counters[s * 256u + digit];
-            counters[s * 256u + digit] = total;
-            total += here;
-        }
-        aggregates[digit] = total;
-        sums[0][digit] = total;
-        if (first < count) {
-            atomicOr(tile_status[status_base + tile * 256u + digit],
-                     tile == 0u ? FLAG_INCLUSIVE | total : FLAG_AGGREGATE | total);
-        }
-    }
-    barrier();
-    uint side = 0u;
-    for (uint reach = 1u; reach < 256u; reach <<= 1u) {
-        for (uint digit = thread; digit < 256u; digit += THREADS) {
-            uint sum = sums[side][digit];
-            if (digit >= reach) sum += sums[side][digit - reach];
-            sums[1u - side][digit] = sum;
-        }
-        side = 1u - side;
-        barrier();
-    }
-    for (uint digit = thread; digit < 256u; digit += THREADS) {
-        uint start = sums[side][digit] - aggregates[digit];
-        for (uint s = 0u; s < SUBGROUPS; s++) counters[s * 256u + digit] += start;
-        uint exclusive_prefix = 0u;
-        if (first < count && tile > 0u) {
-            uint predecessor = tile - 1u;
-            uint status = 0u;
-            uint spins = 0u;
-            while ((status & FLAG_INCLUSIVE) == 0u) {
-                status = atomicOr(tile_status[status_base + predecessor * 256u + digit], 0u);
-                if (status == 0u && ++spins > MAX_SPINS) {
-                    status = count_digit(predecessor, digit) |
-                             (predecessor == 0u ? FLAG_INCLUSIVE : FLAG_AGGREGATE);
-                }
-                if (status != 0u) {
-                    exclusive_prefix += status & COUNT_MASK;
-                    predecessor -= 1u;
-                }
+    // digits, those of the tile and those of all pairs.
+    uvec2 starts[DIGITS_PER_THREAD];
+    for (uint k = 0u; k < DIGITS_PER_THREAD; k++) {
+        uint digit = k * THREADS + thread;
+        if (digit < 256u) { // of a whole subgroup
+            uint total = 0u;
+            for (uint s = 0u; s < SUBGROUPS; s++) {
+                uint here = counters[s * 256u + digit];
+                counters[s * 256u + digit] = total;
+                total += here;
             }
-            // FLAG_AGGREGATE | aggregate becomes FLAG_INCLUSIVE | (exclusive_prefix + aggregate).
-            atomicAdd(tile_status[status_base + tile * 256u + digit], FLAG_AGGREGATE + exclusive_prefix);
+            atomicOr(zeros[statuses + tile * 256u + digit], (tile == 0u ? FLAG_INCLUSIVE : FLAG_AGGREGATE) | total);
+            starts[k] = uvec2(subgroupExclusiveAdd(counted(total)), subgroupExclusiveAdd(everywhere[k]));
+            if (lane == SUBGROUP_SIZE - 1u) {
+                chunk_sums[digit / SUBGROUP_SIZE] = starts[k] + uvec2(total, everywhere[k]);
+            }
         }
-        offsets[digit] = digit_bases[pass * 256u + digit] + exclusive_prefix - start;
     }
     barrier();
-
+    for (uint k = 0u; k < DIGITS_PER_THREAD; k++) {
+        uint digit = k * THREADS + thread;
+        if (digit < 256u) {
+            for (uint c = 0u; c < digit / SUBGROUP_SIZE; c++) starts[k] += chunk_sums[c];
+            for (uint s = 0u; s < SUBGROUPS; s++) counters[s * 256u + digit] += starts[k].x;
+        }
+    }
+    barrier();
+    // The other tiles publish their aggregates while the pairs are staged.
     for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
         uint index = first + (subgroup * PAIRS_PER_THREAD + i) * SUBGROUP_SIZE + lane;
-        uint digit = index < count ? ((own[i].x & mask) >> (8u * pass)) & 255u : 255u;
+        uint digit = index < end ? digit_of(own[i].x) : 255u;
         staged[counters[subgroup * 256u + digit] + ranks[i]] = own[i];
+    }
+    for (uint k = 0u; k < DIGITS_PER_THREAD; k++) {
+        uint digit = k * THREADS + thread;
+        if (digit < 256u) {
+            uint prefix = look_back(statuses, tile, digit, polls);
+            // FLAG_AGGREGATE | aggregate becomes FLAG_INCLUSIVE | (prefix + aggregate).
+            if (tile > 0u) atomicAdd(zeros[statuses + tile * 256u + digit], FLAG_AGGREGATE + prefix);
+            offsets[digit] = starts[k].y + prefix - starts[k].x;
+        }
     }
     barrier();
     for (uint position = thread; position < TILE; position += THREADS) {
-        if (first + position < count) {
+        if (first + position < end) {
             uvec2 pair = staged[position];
-            sorted[offsets[((pair.x & mask) >> (8u * pass)) & 255u] + position] = pair;
+            sorted[offsets[digit_of(pair.x)] + position] = pair;
         }
     }
 }

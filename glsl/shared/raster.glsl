@@ -37,8 +37,10 @@ uvec2 own_item;
 #if SHARED_SPLATS
 #define VALUE_VECTORS ((CHANNELS + 3) / 4)
 #define SPLAT_VECTORS (2 + VALUE_VECTORS)
-// Projected splats without the padding of PROJECTED_VECTORS, followed by their features.
-shared vec4 splats[SPLAT_VECTORS * SUBGROUP_SIZE];
+// Values of the geometry and of the channels, of this batch and of the one before: a lane that is
+// ahead writes the next batch while others still read this one.
+shared vec4 splats[2 * SPLAT_VECTORS * SUBGROUP_SIZE];
+uint batch_start = 0; // vectors
 // The next batch is on its way from memory while the lanes blend this one.
 uvec2 next_item;
 vec4 next_splat[SPLAT_VECTORS];
@@ -69,18 +71,20 @@ void begin_batches(uint first, uint last, uint lane) {
 void load_batch(uint j, uint last, uint lane) {
     own_item = next_item;
     if (j + lane >= last) next_splat[1].y = -1e4;
-    barrier(); // other lanes may still read the batch before
-    [[unroll]] for (int k = 0; k < SPLAT_VECTORS; k++) splats[SPLAT_VECTORS * lane + k] = next_splat[k];
+    batch_start = SPLAT_VECTORS * SUBGROUP_SIZE - batch_start;
+    [[unroll]] for (int k = 0; k < SPLAT_VECTORS; k++)
+        splats[batch_start + SPLAT_VECTORS * lane + k] = next_splat[k];
     fetch(j + SUBGROUP_SIZE + lane, last);
     barrier();
 }
 
-vec2 centre_of(uint i) { return splats[SPLAT_VECTORS * i].xy; }
-vec3 conic_of(uint i) { return vec3(splats[SPLAT_VECTORS * i].zw, splats[SPLAT_VECTORS * i + 1].x); }
-float log2_opacity_of(uint i) { return splats[SPLAT_VECTORS * i + 1].y; }
+vec4 vector_of(uint i, int k) { return splats[batch_start + SPLAT_VECTORS * i + k]; }
+vec2 centre_of(uint i) { return vector_of(i, 0).xy; }
+vec3 conic_of(uint i) { return vec3(vector_of(i, 0).zw, vector_of(i, 1).x); }
+float log2_opacity_of(uint i) { return vector_of(i, 1).y; }
 // Called before value_of.
 void load_values(uint i) {
-    [[unroll]] for (int k = 0; k < VALUE_VECTORS; k++) values[k] = splats[SPLAT_VECTORS * i + 2 + k];
+    [[unroll]] for (int k = 0; k < VALUE_VECTORS; k++) values[k] = vector_of(i, 2 + k);
 }
 float value_of(uint i, int channel) { return values[channel / 4][channel % 4]; }
 #else

@@ -52,6 +52,7 @@ const CASES: &[Case] = &[
     case("projection and rendering", Some(KernelVariant::SortedLists), |d| {
         render::forward(d, TileBinning::Sorting)
     }),
+    case("tile lists", Some(KernelVariant::SortedLists), render::sorted_lists),
     case("gradients", Some(KernelVariant::StoredGradients), |d| {
         render::backward(d, GradientReduction::Entries)
     }),

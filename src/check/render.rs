@@ -1,5 +1,5 @@
 //! Checks of rendering and its gradients.
-use super::compared::{Found, close, worst};
+use super::compared::{Found, close, equal, worst};
 use crate::gpu::{Device, Recorder};
 use crate::math::Random;
 use crate::pass::adam::{BETA, Moments, Schedule, adam};
@@ -9,8 +9,8 @@ use crate::pass::params::Params;
 use crate::pass::raster_forward::Cutoffs;
 use crate::pass::reference::{self, Forward};
 use crate::pass::{
-    DeviceChoices, FeatureMode, GradientReduction, RasterOptions, Rasterizer, ShGradientKernel, SplatBuffers,
-    TileBinning, TileSums, View,
+    DeviceChoices, FeatureMode, GradientReduction, KernelVariant, RasterOptions, Rasterizer,
+    ShGradientKernel, SplatBuffers, TileBinning, TileSums, View,
     regularise::{self, RatioPenalty},
 };
 use crate::scene::Splats;
@@ -73,17 +73,37 @@ pub(super) fn forward(device: &Device, grouping: TileBinning) -> Found {
     ]))
 }
 
+/// Compares the tile lists by sorting with those by counters, of more splats than one chunk has and
+/// some on hundreds of tiles. Without counters that are right there is no comparison.
+pub(super) fn sorted_lists(device: &Device) -> Found {
+    if device.info().disabled.contains(KernelVariant::CountedLists.name()) {
+        return Ok(Ok("not compared".to_owned()));
+    }
+    let [width, height] = [400, 300];
+    let (mut splats, camera) = seeded::small(3000, width, height, 0, 13);
+    splats.log_scales.iter_mut().step_by(100).for_each(|s| *s = [0.0; 3]);
+    let params = SplatBuffers::upload(device, &splats, &[], 0)?;
+    let lists = |grouping, summation| -> crate::Result<Vec<u32>> {
+        let choices = DeviceChoices { grouping, summation, ..DeviceChoices::of(device) };
+        let mut raster = Rasterizer::with(device, splats.len(), 0, width, height, choices)?;
+        raster.set_view(&View::new(&camera, 0.05))?;
+        raster.forward(&params, &RasterOptions { sh_degree: 0, ..RasterOptions::default() })?;
+        Ok(raster.tile_lists()?.iter().flat_map(|l| [&[l.len() as u32], l.as_slice()].concat()).collect())
+    };
+    let (atomics, entries) = (GradientReduction::Atomics, GradientReduction::Entries);
+    let counted = lists(TileBinning::Counting, atomics)?;
+    let sorted = equal("lists", &lists(TileBinning::Sorting, atomics)?, &counted);
+    Ok(sorted.and(equal("lists with entries", &lists(TileBinning::Sorting, entries)?, &counted)))
+}
+
 pub(super) fn backward(device: &Device, summation: GradientReduction) -> Found {
     gradients(device, FEATURES, DeviceChoices { summation, ..DeviceChoices::of(device) })
 }
 
 /// Without features: these use shuffles always.
 pub(super) fn tile_sums(device: &Device, tile_sums: TileSums) -> Found {
-    let choices = DeviceChoices {
-        summation: GradientReduction::Atomics,
-        tile_sums,
-        ..DeviceChoices::of(device)
-    };
+    let choices =
+        DeviceChoices { summation: GradientReduction::Atomics, tile_sums, ..DeviceChoices::of(device) };
     gradients(device, 0, choices)
 }
 

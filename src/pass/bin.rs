@@ -1,18 +1,24 @@
 //! Tile lists: for every 8×8 tile the splats that can change it, nearest first.
 //!
-//! The first pass counts the tiles of each splat in depth order. A scan of these counts gives every
-//! (splat, tile) entry its position, and lanes with equal shares of the entries write them. A
-//! stable grouping by tile follows: on a CPU device by counting, with a counter per tile and lane,
-//! on a GPU by a radix sort of the few bits of the tile. No (tile, depth) pair is ever sorted.
+//! Every (splat, tile) entry gets its position by a scan of the numbers of tiles of the splats in
+//! depth order. On a CPU device, three passes count, scan and write the entries, in lanes with
+//! equal shares, and a stable grouping by tile follows with a counter per tile and lane. On a GPU,
+//! one sweep counts, scans and writes, splats with many tiles are shared by all workgroups, and a
+//! radix sort of the few bits of the tile groups the entries. No (tile, depth) pair is ever sorted.
 //!
 //! A splat is listed where `max over the tile's pixel centres of o e^p ≥ 1/255`:
 //! `glsl/shared/tiles.glsl`.
-use super::frame::FrameBuffers;
+use super::frame::{FrameBuffers, GradientReduction};
 use super::project::Projected;
-use super::sort::Sort;
-use super::tile_lists::{Group, SORTING_LANES, TILE, TileLists};
+use super::sort::{Prepared, rows_of_groups};
+use super::tile_lists::{CHUNK_SPLATS, Counting, Group, Lists, Sorting, TILE, tile_bits};
 use crate::gpu::{Buffer, Recorder, shaders};
 use std::ops::Range;
+
+/// Workgroups that share the large splats: enough to fill any GPU, and few where there are none.
+const LARGE_GROUPS: u32 = 512;
+/// Places of the lists per thread: more would wait for memory one after the other.
+const RANGES_PER_THREAD: u32 = 4;
 
 /// Records counting, writing and grouping of the entries of `count` depth-sorted splats on these
 /// rows of tiles; `splat_count` holds the same number on the device. Writes the lists to
@@ -21,10 +27,29 @@ pub(super) fn record(
     rec: &mut Recorder,
     frame: &FrameBuffers,
     rows: &Range<u32>,
-    count: usize,
-    splat_count: &Buffer<u32>,
+    (count, splat_count): (usize, &Buffer<u32>),
+    state: Lists,
 ) {
-    let (tiles_x, count, lists) = (frame.tiles()[0], count as u32, &frame.lists);
+    let (count, lists) = (count as u32, &frame.lists);
+    match &lists.group {
+        Group::Counting(group) => record_counting(rec, frame, rows, (count, splat_count), group),
+        Group::Sorting(group) => {
+            if state == Lists::Used {
+                rec.fill(lists.zeros().0, 0);
+            }
+            record_sorting(rec, frame, rows, count, group);
+        }
+    }
+}
+
+fn record_counting(
+    rec: &mut Recorder,
+    frame: &FrameBuffers,
+    rows: &Range<u32>,
+    (count, splat_count): (u32, &Buffer<u32>),
+    Counting { scan, counters, lanes }: &Counting,
+) {
+    let (tiles_x, lists, lanes) = (frame.tiles()[0], &frame.lists, *lanes);
     let (first_row, end_row, tiles) = (rows.start, rows.end, tiles_x * (rows.end - rows.start));
     let call = shaders::bin_count::call(
         &shaders::bin_count::Bindings {
@@ -35,21 +60,9 @@ pub(super) fn record(
         &shaders::bin_count::Push { count, tiles_x, first_row, end_row },
     );
     rec.dispatch_threads(call, [count, 1, 1]);
-    lists.scan.record(rec, &lists.counts, splat_count, &lists.starts, &frame.status);
-    let (grouping, lanes) = match &lists.group {
-        Group::Counting { counters, lanes } => {
-            rec.fill(counters, 0);
-            (0, *lanes)
-        }
-        Group::Sorting { .. } => (1, SORTING_LANES),
-    };
-    // The shader does not use the buffers of the other grouping; any buffer may be bound there.
-    let (counters, entry_splats) = match &lists.group {
-        Group::Counting { counters, .. } => (counters, counters),
-        Group::Sorting { entry_splats, .. } => (entry_splats, entry_splats),
-    };
+    scan.record(rec, &lists.counts, splat_count, &lists.starts, &frame.status);
+    rec.fill(counters, 0);
     let call = shaders::bin_emit::call(
-        shaders::bin_emit::Variant { grouping },
         &shaders::bin_emit::Bindings {
             projected: &frame.projected,
             depth_pairs: &frame.depth_pairs,
@@ -58,7 +71,6 @@ pub(super) fn record(
             entry_count: &lists.entry_count,
             entries: &lists.entries,
             counters,
-            entry_splats,
         },
         &shaders::bin_emit::Push {
             count,
@@ -70,10 +82,7 @@ pub(super) fn record(
         },
     );
     rec.dispatch_threads(call, [lanes, 1, 1]);
-    match &lists.group {
-        Group::Counting { counters, lanes } => group_by_counting(rec, frame, tiles, counters, *lanes),
-        Group::Sorting { entry_splats, sort } => group_by_sorting(rec, lists, tiles, entry_splats, sort),
-    }
+    group_by_counting(rec, frame, tiles, counters, lanes);
 }
 
 fn group_by_counting(
@@ -112,26 +121,61 @@ fn group_by_counting(
     rec.dispatch_threads(call, [lanes, 1, 1]);
 }
 
-fn group_by_sorting(
-    rec: &mut Recorder,
-    lists: &TileLists,
-    tiles: u32,
-    entry_splats: &Buffer<u32>,
-    sort: &Sort,
-) {
-    let bits = u32::BITS - tiles.leading_zeros();
-    sort.record(rec, &lists.entries, &lists.entry_count, bits);
+/// Records one sweep over the splats that writes their entries, the sort, and the lists.
+fn record_sorting(rec: &mut Recorder, frame: &FrameBuffers, rows: &Range<u32>, count: u32, group: &Sorting) {
+    let (tiles_x, lists) = (frame.tiles()[0], &frame.lists);
+    let (first_row, end_row, tiles) = (rows.start, rows.end, tiles_x * (rows.end - rows.start));
+    let (entries, capacity) = (&lists.entries, lists.capacity as u32);
+    let Sorting { large_splats, entry_splats, sort } = group;
+    let bits = tile_bits(tiles);
+    let (zeros, _) = sort.zeros(bits);
+    let (first_digit, passes) = sort.digits(bits);
+    // Only sums per entry need its index: otherwise the sort moves the splats themselves.
+    let indexed = u32::from(frame.summation == GradientReduction::Entries);
+    let call = shaders::bin_sweep::call(
+        shaders::bin_sweep::Variant { indexed },
+        &shaders::bin_sweep::Bindings {
+            projected: &frame.projected,
+            depth_pairs: &frame.depth_pairs,
+            status: &frame.status,
+            entry_count: &lists.entry_count,
+            entries,
+            zeros,
+            large_splats,
+            entry_splats,
+            tile_counts: &lists.counts,
+            starts: &lists.starts,
+        },
+        &shaders::bin_sweep::Push { count, tiles_x, first_row, end_row, capacity, first_digit, passes },
+    );
+    // At least one workgroup, which writes the number of entries.
+    rec.dispatch(call, rows_of_groups((count as usize).div_ceil(CHUNK_SPLATS)));
+    let most = capacity / shaders::bin_sweep::LARGE as u32;
+    let call = shaders::bin_large::call(
+        shaders::bin_large::Variant { indexed },
+        &shaders::bin_large::Bindings {
+            projected: &frame.projected,
+            large_splats,
+            entries,
+            zeros,
+            entry_splats,
+        },
+        &shaders::bin_large::Push { tiles_x, first_row, end_row, capacity, first_digit, passes, most },
+    );
+    rec.dispatch(call, [most.clamp(1, LARGE_GROUPS), 1, 1]);
+    let sorted = sort.record_prepared(rec, entries, &lists.entry_count, bits, Prepared::Counted);
     let call = shaders::bin_ranges::call(
+        shaders::bin_ranges::Variant { indexed },
         &shaders::bin_ranges::Bindings {
             entry_count: &lists.entry_count,
-            entries: &lists.entries,
-            entry_splats,
+            entries: sorted,
             tile_ranges: &lists.ranges,
             tile_splats: &lists.splats,
+            entry_splats,
         },
-        &shaders::bin_ranges::Push { tiles, lanes: SORTING_LANES },
+        &shaders::bin_ranges::Push { tiles },
     );
-    rec.dispatch_threads(call, [SORTING_LANES, 1, 1]);
+    rec.dispatch_threads(call, [(capacity / RANGES_PER_THREAD).clamp(1 << 16, 1 << 22), 1, 1]);
 }
 
 /// CPU reference of the lists, `[tiles]`, each in the order of `order`: tests every splat against

@@ -10,6 +10,7 @@
 use super::frame::FrameBuffers;
 use super::options::FeatureMode;
 use super::params::Params;
+use super::sort::Sort;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::shared::splat::{DILATION, SMALLEST_AREA};
@@ -18,16 +19,23 @@ use crate::gpu::{Buffer, Recorder, shaders};
 use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
+/// Bits of the depth keys: those of camera z.
+pub(super) const DEPTH_BITS: u32 = 32;
+
 /// Records the projection of all splats to `frame.projected` and `frame.depth_pairs`, with the
-/// first (sh_degree + 1)² SH coefficients.
-pub fn record(
+/// first (sh_degree + 1)² SH coefficients. Writes their number to `splat_count` and clears the
+/// counters of `sort` and of the tile lists.
+pub(super) fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,
     camera: &Buffer<CameraView>,
     frame: &FrameBuffers,
     sh_degree: u32,
+    (sort, splat_count): (&Sort, &Buffer<u32>),
 ) {
     let count = splats.count as u32;
+    let (sort_zeros, sort_words) = sort.zeros(DEPTH_BITS);
+    let (list_zeros, list_words) = frame.lists.zeros();
     let call = shaders::project::call(
         shaders::project::Variant { sh_degree },
         &shaders::project::Bindings {
@@ -39,14 +47,20 @@ pub fn record(
             sh: &splats.sh,
             projected: &frame.projected,
             depth_pairs: &frame.depth_pairs,
+            splat_count,
+            sort_zeros,
+            list_zeros,
         },
         &shaders::project::Push {
             count,
             sh_stride: splats.sh_len() as u32,
             antialiased: splats.antialiased.into(),
+            sort_words,
+            list_words,
         },
     );
-    rec.dispatch_threads(call, [count, 1, 1]);
+    // Without splats, one workgroup clears the counters.
+    rec.dispatch_threads(call, [count.max(1), 1, 1]);
 }
 
 /// Records the map from stored to rendered features, `frame.codes`. Records nothing without

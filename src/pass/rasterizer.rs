@@ -41,13 +41,14 @@
 use super::bands::{Band, Bands};
 use super::channels::BASE_CHANNELS;
 use super::frame::{
-    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, GradientReduction, PROJECTED_FLOATS, TileSums,
-    Tiles, entry_bytes,
+    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, GradientReduction, PROJECTED_FLOATS, TileSums, Tiles,
+    entry_bytes,
 };
 use super::fused_update::{self, SplatAdam};
+use super::project::DEPTH_BITS;
 use super::project_backward::ShGradientKernel;
-use super::sort::Sort;
-use super::tile_lists::{self, LONGEST_LIST, TILE, TileBinning, TileLists};
+use super::sort::{Prepared, Sort};
+use super::tile_lists::{self, LONGEST_LIST, Lists, TILE, TileBinning, TileLists};
 use super::view::View;
 use super::{bin, project, project_backward, raster_backward, raster_forward};
 use crate::gpu::shaders::structs::CameraView;
@@ -222,7 +223,7 @@ impl Rasterizer {
     pub fn record_forward(&self, rec: &mut Recorder, params: &SplatBuffers, options: &RasterOptions) {
         self.refuse_bands(rec);
         self.record_projection(rec, params, options);
-        self.record_band(rec, params, &self.frame.bands.get(0));
+        self.record_strips(rec, params, &self.frame.bands.get(0), Lists::Cleared);
     }
 
     /// Records the backward pass from `frame().planes_grad` to `gradients` (overwritten; zero for
@@ -251,19 +252,28 @@ impl Rasterizer {
     pub fn record_projection(&self, rec: &mut Recorder, params: &SplatBuffers, options: &RasterOptions) {
         let sh_degree = options.sh_degree.min(params.sh_degree);
         rec.pass("projection");
-        project::record(rec, params, &self.camera, &self.frame, sh_degree);
+        let sort = (&self.sort, &self.count);
+        project::record(rec, params, &self.camera, &self.frame, sh_degree, sort);
         project::record_features(rec, params, &self.frame, options.feature_mode);
         rec.pass("depth sort");
         // Keys are the bits of camera z. The sort is stable: equal depths keep the order of the
         // splats.
-        rec.fill(&self.count, params.count as u32);
-        self.sort.record(rec, &self.frame.depth_pairs, &self.count, 32);
+        let pairs = &self.frame.depth_pairs;
+        let sorted = self.sort.record_prepared(rec, pairs, &self.count, DEPTH_BITS, Prepared::Cleared);
+        debug_assert_eq!(sorted.id(), pairs.id(), "an even number of passes sorts in place");
     }
 
     /// Records binning and blending of a band.
     pub fn record_band(&self, rec: &mut Recorder, params: &SplatBuffers, band: &Band) {
+        self.record_strips(rec, params, band, Lists::Used);
+    }
+
+    /// [`Rasterizer::record_band`], directly after the projection if the lists are cleared.
+    fn record_strips(&self, rec: &mut Recorder, params: &SplatBuffers, band: &Band, first: Lists) {
+        let mut state = first;
         for tiles in self.strips(band, band.top..band.top + band.rows) {
-            self.record_lists(rec, params, &tiles);
+            self.record_lists(rec, params, &tiles, state);
+            state = Lists::Used;
             rec.pass("raster forward");
             raster_forward::record(rec, &self.camera, &self.frame, &tiles);
         }
@@ -289,7 +299,7 @@ impl Rasterizer {
                 raster_backward::record_clear(rec, &self.frame);
             }
             for tiles in inner {
-                self.record_lists(rec, params, &tiles);
+                self.record_lists(rec, params, &tiles, Lists::Used);
                 rec.pass("raster backward");
                 raster_backward::record(rec, &self.frame, &tiles, params.count, coupled, false);
             }
@@ -369,9 +379,9 @@ impl Rasterizer {
         fused_update::record(rec, params, &self.camera, &self.frame, self.projection_groups, state);
     }
 
-    fn record_lists(&self, rec: &mut Recorder, params: &SplatBuffers, tiles: &Tiles) {
+    fn record_lists(&self, rec: &mut Recorder, params: &SplatBuffers, tiles: &Tiles, state: Lists) {
         rec.pass("binning");
-        bin::record(rec, &self.frame, &tiles.rows, params.count, &self.count);
+        bin::record(rec, &self.frame, &tiles.rows, (params.count, &self.count), state);
     }
 
     /// Divides rows of pixels of a band into strips of tiles that are binned at once.
@@ -424,10 +434,12 @@ impl Rasterizer {
         self.check(params)?;
         loop {
             let mut rec = Recorder::new(&self.device, "forward");
+            let mut state = Lists::Used;
             if band.index == 0 {
                 self.record_projection(&mut rec, params, options);
+                state = Lists::Cleared;
             }
-            self.record_band(&mut rec, params, band);
+            self.record_strips(&mut rec, params, band, state);
             rec.download(&self.frame.status);
             rec.run()?;
             match self.overflow()? {

@@ -8,7 +8,6 @@
 //! pass reads and writes every pair once, coalesced. A partition tile finds its exclusive prefix by
 //! decoupled look-back, and counts a predecessor itself where that makes no progress. Both are
 //! correct on any device and any subgroup size.
-use super::adam::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, LOOP_ROUNDS, Recorder, shaders};
 use crate::pass::KernelVariant;
@@ -38,14 +37,18 @@ impl SortAlgorithm {
 /// Scratch space for sorting up to `capacity` pairs.
 pub struct Sort {
     scratch: Buffer<u32>,
+    /// Words that are zero when a sort begins: `room` words of the caller, and those of
+    /// [`Work::Sweep`], from there on [4, 256] digit counts and the tile status of each pass.
+    zeros: Buffer<u32>,
+    room: usize,
     work: Work,
 }
 
 enum Work {
     /// [lanes, 256] digit counts.
     Chunks { histogram: Buffer<u32>, lanes: u32 },
-    /// [4, 256] digit counts of the passes, and the tile status of each pass.
-    Sweep { digits: Buffer<u32>, tiles: Buffer<u32> },
+    /// Words of the tile status of one pass.
+    Sweep { stride: usize },
 }
 
 /// Bits per pass: 256 counters for each of 8 lanes are 8 KiB of shared memory.
@@ -54,14 +57,33 @@ const DIGIT_BITS: u32 = 8;
 const PASSES: usize = (u32::BITS / DIGIT_BITS) as usize;
 /// Pairs per partition tile in `glsl/sort_sweep.comp`.
 const TILE: usize = shaders::sort_sweep::TILE as usize;
-/// Pairs per thread in `glsl/sort_digits.comp`.
-const DIGITS_PAIRS_PER_THREAD: usize = shaders::sort_digits::PAIRS_PER_THREAD as usize;
+/// Loads in flight per thread in `glsl/sort_digits.comp`.
+const DIGITS_BLOCK: usize = shaders::sort_digits::BLOCK as usize;
+/// Words of the digit counts.
+const DIGITS: usize = PASSES << DIGIT_BITS;
 
 /// Bits of the key that one call sorts by.
 #[derive(Clone, Copy)]
 struct Key {
     mask: u32,
     passes: u32,
+}
+
+impl Key {
+    fn new(bits: u32) -> Key {
+        let bits = bits.min(32);
+        let mask = if bits == 32 { u32::MAX } else { (1 << bits) - 1 };
+        Key { mask, passes: bits.div_ceil(DIGIT_BITS) }
+    }
+}
+
+/// Work that the passes before a sort did for it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Prepared {
+    /// The [`Sort::zeros`] are zero.
+    Cleared,
+    /// Besides, the digits were counted where [`Sort::digits`] says.
+    Counted,
 }
 
 impl Sort {
@@ -72,37 +94,86 @@ impl Sort {
 
     /// [`Sort::new`] with a given algorithm.
     pub fn with(device: &Device, capacity: usize, algorithm: SortAlgorithm) -> Result<Sort> {
-        let work = match algorithm {
+        Self::with_room(device, capacity, algorithm, 0)
+    }
+
+    /// [`Sort::with`] and `room` words before its own [`Sort::zeros`], for the passes before it.
+    pub(super) fn with_room(
+        device: &Device,
+        capacity: usize,
+        algorithm: SortAlgorithm,
+        room: usize,
+    ) -> Result<Sort> {
+        let (work, words) = match algorithm {
             SortAlgorithm::Chunks => {
                 // 256 lanes measured best on lavapipe for 100k to 1M pairs; more pairs need more
                 // lanes, since its loops are limited.
                 let lanes = capacity.div_ceil(LOOP_ROUNDS / 2).next_multiple_of(256).max(256);
-                Work::Chunks {
-                    histogram: device.buffer::<u32>("sort histogram", 256 * lanes)?,
-                    lanes: lanes as u32,
-                }
+                let histogram = device.buffer::<u32>("sort histogram", 256 * lanes)?;
+                (Work::Chunks { histogram, lanes: lanes as u32 }, 0)
             }
-            SortAlgorithm::Sweep => Work::Sweep {
-                digits: device.buffer::<u32>("sort digits", PASSES * 256)?,
-                tiles: device.buffer::<u32>("sort tiles", PASSES * (1 + 256 * capacity.div_ceil(TILE)))?,
-            },
+            SortAlgorithm::Sweep => {
+                let stride = 1 + 256 * capacity.div_ceil(TILE);
+                (Work::Sweep { stride }, DIGITS + PASSES * stride)
+            }
         };
-        Ok(Sort { scratch: device.buffer::<u32>("sort scratch", 2 * capacity)?, work })
+        Ok(Sort {
+            scratch: device.buffer::<u32>("sort scratch", 2 * capacity)?,
+            zeros: device.buffer::<u32>("sort zeros", (room + words).max(1))?,
+            room,
+            work,
+        })
+    }
+
+    /// Words that must be zero before a sort by `bits` bits that is [`Prepared`]: the first ones of
+    /// a buffer, beginning with the caller's own.
+    pub(super) fn zeros(&self, bits: u32) -> (&Buffer<u32>, u32) {
+        let words = match &self.work {
+            Work::Chunks { .. } => 0,
+            Work::Sweep { stride } => DIGITS + Key::new(bits).passes as usize * stride,
+        };
+        (&self.zeros, (self.room + words) as u32)
+    }
+
+    /// Place in the zeros where a pass before the sort may count the digits of the keys, as
+    /// `[passes, 256]`, and the passes; none where the algorithm does not need the counts.
+    pub(super) fn digits(&self, bits: u32) -> (u32, u32) {
+        let passes = match &self.work {
+            Work::Chunks { .. } => 0,
+            Work::Sweep { .. } => Key::new(bits).passes,
+        };
+        (self.room as u32, passes)
     }
 
     /// Records the stable sort of the first `count[0]` elements of `pairs` (`[N]` of (key, value))
     /// by the lowest `bits` bits of the key; later elements are undefined afterwards. `count` is
     /// read on the device. Reference: [`sort_pairs`].
     pub fn record(&self, rec: &mut Recorder, pairs: &Buffer<u32>, count: &Buffer<u32>, bits: u32) {
+        if let Work::Sweep { .. } = &self.work {
+            rec.fill(&self.zeros, 0);
+        }
+        let sorted = self.record_prepared(rec, pairs, count, bits, Prepared::Cleared);
+        if sorted.id() != pairs.id() {
+            rec.copy_bytes(sorted, 0, pairs, 0, pairs.bytes());
+        }
+    }
+
+    /// [`Sort::record`] after other preparation, and without a copy: returns the buffer that holds
+    /// the sorted pairs, `pairs` or the scratch buffer.
+    pub(super) fn record_prepared<'a>(
+        &'a self,
+        rec: &mut Recorder,
+        pairs: &'a Buffer<u32>,
+        count: &Buffer<u32>,
+        bits: u32,
+        prepared: Prepared,
+    ) -> &'a Buffer<u32> {
         if pairs.bytes() > self.scratch.bytes() {
             rec.fail(format!("sort: `{}` has more pairs than the capacity of the sort", pairs.name()));
         }
-        let bits = bits.min(32);
-        let mask = if bits == 32 { u32::MAX } else { (1 << bits) - 1 };
-        let key = Key { mask, passes: bits.div_ceil(DIGIT_BITS) };
-        if let Work::Sweep { digits, tiles } = &self.work {
-            rec.fill(tiles, 0);
-            record_digits(rec, pairs, count, digits, key);
+        let key = Key::new(bits);
+        if let (Work::Sweep { .. }, Prepared::Cleared) = (&self.work, prepared) {
+            self.record_digits(rec, pairs, count, key);
         }
         let (mut from, mut to) = (pairs, &self.scratch);
         for pass in 0..key.passes {
@@ -110,15 +181,49 @@ impl Sort {
                 Work::Chunks { histogram, lanes } => {
                     record_chunks(rec, (from, to), count, (histogram, *lanes), (key, pass));
                 }
-                Work::Sweep { digits, tiles } => {
-                    record_sweep(rec, (from, to), count, (digits, tiles), (key, pass));
-                }
+                Work::Sweep { stride } => self.record_sweep(rec, (from, to), count, *stride, (key, pass)),
             }
             (from, to) = (to, from);
         }
-        if key.passes % 2 == 1 {
-            rec.copy_bytes(&self.scratch, 0, pairs, 0, pairs.bytes());
-        }
+        from
+    }
+
+    /// Records the digit histograms of all passes.
+    fn record_digits(&self, rec: &mut Recorder, pairs: &Buffer<u32>, count: &Buffer<u32>, key: Key) {
+        // About a workgroup per multiprocessor of a large GPU, which adds 1024 sums at the end.
+        let rounds =
+            capacity(pairs).div_ceil(256 * 128).next_multiple_of(DIGITS_BLOCK).clamp(DIGITS_BLOCK, 32);
+        let call = shaders::sort_digits::call(
+            &shaders::sort_digits::Bindings { pairs, count, zeros: &self.zeros },
+            &shaders::sort_digits::Push {
+                mask: key.mask,
+                passes: key.passes,
+                first_digit: self.room as u32,
+                rounds: rounds as u32,
+            },
+        );
+        rec.dispatch(call, rows_of_groups(capacity(pairs).div_ceil(256 * rounds)));
+    }
+
+    fn record_sweep(
+        &self,
+        rec: &mut Recorder,
+        (from, to): (&Buffer<u32>, &Buffer<u32>),
+        count: &Buffer<u32>,
+        stride: usize,
+        (key, pass): (Key, u32),
+    ) {
+        let call = shaders::sort_sweep::call(
+            &shaders::sort_sweep::Bindings { pairs: from, count, zeros: &self.zeros, sorted: to },
+            &shaders::sort_sweep::Push {
+                pass,
+                mask: key.mask,
+                first_digit: self.room as u32,
+                stride: stride as u32,
+            },
+        );
+        // Workgroups beyond the last tile do nothing.
+        rec.dispatch(call, rows_of_groups(capacity(from).div_ceil(TILE)));
     }
 }
 
@@ -154,39 +259,11 @@ fn record_chunks(
     );
 }
 
-/// Records the digit histograms of all passes and their exclusive scans.
-fn record_digits(
-    rec: &mut Recorder,
-    pairs: &Buffer<u32>,
-    count: &Buffer<u32>,
-    digits: &Buffer<u32>,
-    key: Key,
-) {
-    rec.fill(digits, 0);
-    let call = shaders::sort_digits::call(
-        &shaders::sort_digits::Bindings { pairs, count, digits },
-        &shaders::sort_digits::Push { mask: key.mask, passes: key.passes },
-    );
-    rec.dispatch(call, rows_of_groups(capacity(pairs).div_ceil(DIGITS_PAIRS_PER_THREAD)));
-    let call = shaders::sort_bases::call(&shaders::sort_bases::Bindings { digits });
-    rec.dispatch(call, [key.passes.max(1), 1, 1]);
-}
-
-fn record_sweep(
-    rec: &mut Recorder,
-    (from, to): (&Buffer<u32>, &Buffer<u32>),
-    count: &Buffer<u32>,
-    (digits, tiles): (&Buffer<u32>, &Buffer<u32>),
-    (key, pass): (Key, u32),
-) {
-    let call = shaders::sort_sweep::call(
-        &shaders::sort_sweep::Bindings { pairs: from, count, digits, tiles, sorted: to },
-        &shaders::sort_sweep::Push { pass, mask: key.mask, stride: (tiles.len() / PASSES) as u32 },
-    );
-    // Workgroups beyond the last tile do nothing; a dimension may be limited to 65535.
-    let groups = capacity(from).div_ceil(TILE).max(1);
+/// At least this many workgroups, and at least one; a dimension may be limited to 65535.
+pub(super) fn rows_of_groups(groups: usize) -> [u32; 3] {
+    let groups = groups.max(1);
     let row = groups.min(32768);
-    rec.dispatch(call, [row as u32, groups.div_ceil(row) as u32, 1]);
+    [row as u32, groups.div_ceil(row) as u32, 1]
 }
 
 /// Number of pairs that a buffer holds.

@@ -1,6 +1,6 @@
 //! Memory of the tile lists of [`super::bin`].
 use super::scan::Scan;
-use super::sort::Sort;
+use super::sort::{Sort, SortAlgorithm};
 use crate::Result;
 use crate::gpu::{Buffer, Device, LOOP_ROUNDS, shaders};
 use crate::pass::KernelVariant;
@@ -45,18 +45,37 @@ pub(super) struct TileLists {
     pub entry_count: Buffer<u32>,
     /// Most entries.
     pub capacity: usize,
+    /// Most tiles.
+    tiles: u32,
     pub entries: Buffer<u32>,
-    pub scan: Scan,
     pub group: Group,
 }
 
 pub(super) enum Group {
-    Counting { counters: Buffer<u32>, lanes: u32 },
-    Sorting { entry_splats: Buffer<u32>, sort: Sort },
+    Counting(Counting),
+    Sorting(Sorting),
 }
 
-/// Lanes that write entries before a sort and read them after it: enough to fill any GPU.
-pub(super) const SORTING_LANES: u32 = 1 << 16;
+/// Scratch buffers of [`TileBinning::Counting`].
+pub(super) struct Counting {
+    pub scan: Scan,
+    /// [tiles, lanes].
+    pub counters: Buffer<u32>,
+    pub lanes: u32,
+}
+
+/// Scratch buffers of [`TileBinning::Sorting`].
+pub(super) struct Sorting {
+    /// [capacity / LARGE] (splat, first entry).
+    pub large_splats: Buffer<u32>,
+    /// [capacity] splat of each entry.
+    pub entry_splats: Buffer<u32>,
+    /// Its zeros begin with those of `glsl/bin_sweep.comp`.
+    pub sort: Sort,
+}
+
+/// Splats per workgroup of `glsl/bin_sweep.comp`.
+pub(super) const CHUNK_SPLATS: usize = shaders::bin_sweep::CHUNK_SPLATS as usize;
 
 /// Most entries of a lane of [`TileBinning::Counting`]: its loop also visits rows and splats
 /// without entries.
@@ -79,12 +98,18 @@ impl TileLists {
             TileBinning::Counting => {
                 let lanes = counting_lanes(tiles, capacity, device.info().max_storage_range);
                 let counters = device.buffer::<u32>("tile counters", tiles * lanes as usize)?;
-                Group::Counting { counters, lanes }
+                Group::Counting(Counting { scan: Scan::new(device)?, counters, lanes })
             }
-            TileBinning::Sorting => Group::Sorting {
-                entry_splats: device.buffer::<u32>("entry splats", capacity)?,
-                sort: Sort::new(device, capacity)?,
-            },
+            TileBinning::Sorting => {
+                let chunks = splats.div_ceil(CHUNK_SPLATS).max(1);
+                let room = shaders::bin_sweep::CHUNK_STATUS as usize + chunks;
+                let large = 2 * (capacity / shaders::bin_sweep::LARGE as usize).max(1);
+                Group::Sorting(Sorting {
+                    large_splats: device.buffer::<u32>("large splats", large)?,
+                    entry_splats: device.buffer::<u32>("entry splats", capacity)?,
+                    sort: Sort::with_room(device, capacity, SortAlgorithm::of(device), room)?,
+                })
+            }
         };
         Ok(TileLists {
             ranges: device.buffer::<u32>("tile_ranges", tiles + 1)?,
@@ -93,11 +118,35 @@ impl TileLists {
             starts: device.buffer::<u32>("tile_starts", splats)?,
             entry_count: device.buffer::<u32>("entry_count", 1)?,
             capacity,
+            tiles: tiles as u32,
             entries: device.buffer::<u32>("entries", 2 * capacity)?,
-            scan: Scan::new(device)?,
             group,
         })
     }
+
+    /// Words that must be zero before binning that is [`Lists::Cleared`]: the first ones of a
+    /// buffer.
+    pub fn zeros(&self) -> (&Buffer<u32>, u32) {
+        match &self.group {
+            // Any buffer, of which nothing is cleared.
+            Group::Counting(_) => (&self.entry_count, 0),
+            Group::Sorting(group) => group.sort.zeros(tile_bits(self.tiles)),
+        }
+    }
+}
+
+/// State of [`TileLists::zeros`] before binning.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Lists {
+    /// The projection cleared them.
+    Cleared,
+    /// Earlier lists used them.
+    Used,
+}
+
+/// Bits of a number that is at most `tiles`.
+pub(super) fn tile_bits(tiles: u32) -> u32 {
+    u32::BITS - tiles.leading_zeros()
 }
 
 /// Number of lanes of [`TileBinning::Counting`]. Few lanes keep a CPU device busy, and more only

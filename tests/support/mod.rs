@@ -250,14 +250,20 @@ pub fn in_bands(
     (image, GpuGradients { splats, features, camera }, bands.count())
 }
 
-/// Compares the lists of both groupings, which must be equal and contain those of the reference,
-/// nearest first. Returns the number of entries of the reference, and of additional entries.
+/// Compares the lists of both groupings, with and without the index of each entry; they must be
+/// equal and contain those of the reference, nearest first. Returns the number of entries of the
+/// reference, and of additional entries.
 #[track_caller]
 pub fn assert_lists(device: &Device, scene: &Scene) -> (usize, usize) {
     let forward = scene.reference();
     let expected = bin::reference(&forward.projected, &forward.order, scene.view.size);
-    let counted = tile_lists(scene, device, TileBinning::Counting);
-    assert_eq!(counted, tile_lists(scene, device, TileBinning::Sorting));
+    let lists = |grouping, summation| {
+        tile_lists(scene, device, DeviceChoices { grouping, summation, ..DeviceChoices::of(device) })
+    };
+    let counted = lists(TileBinning::Counting, GradientReduction::Atomics);
+    for summation in [GradientReduction::Atomics, GradientReduction::Entries] {
+        assert_eq!(counted, lists(TileBinning::Sorting, summation), "{summation:?}");
+    }
     assert_eq!(counted.len(), expected.len());
     let mut extra = 0;
     for (list, expected) in counted.iter().zip(&expected) {
@@ -268,9 +274,8 @@ pub fn assert_lists(device: &Device, scene: &Scene) -> (usize, usize) {
     (expected.iter().map(Vec::len).sum(), extra)
 }
 
-fn tile_lists(scene: &Scene, device: &Device, grouping: TileBinning) -> Vec<Vec<u32>> {
-    let (params, mut raster) =
-        scene.upload_for(device, DeviceChoices { grouping, ..DeviceChoices::of(device) });
+fn tile_lists(scene: &Scene, device: &Device, choices: DeviceChoices) -> Vec<Vec<u32>> {
+    let (params, mut raster) = scene.upload_for(device, choices);
     raster.forward(&params, &scene.options).unwrap();
     raster.tile_lists().unwrap()
 }

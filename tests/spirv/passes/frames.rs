@@ -8,9 +8,9 @@ use splatvk::math::Random;
 use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
 use splatvk::pass::raster_forward::{Cutoffs, ReferenceScene, walk};
 use splatvk::pass::{
-    DeviceChoices, FeatureMode, GradientReduction, Rasterizer, ShGradientKernel, TileSums,
+    DeviceChoices, FeatureMode, GradientReduction, Rasterizer, ShGradientKernel, TileBinning, TileSums,
 };
-use splatvk::pass::{decode as decoding, pack as packing, pairs as counting};
+use splatvk::pass::{bin, decode as decoding, pack as packing, pairs as counting};
 use splatvk::scene::seeded;
 
 /// Splats over 27 × 19 pixels: 4 × 3 tiles, partial on two borders.
@@ -27,10 +27,18 @@ fn check_both_directions(device: &Device, scene: &Scene, ways: DeviceChoices) {
     assert_gradients(scene, &scene.gradients_by(device, ways, &upstream), 7);
 }
 
-/// A render in one program.
+/// A render in one program, by every kind of lists.
 pub fn image(device: &Device) {
     let scene = scene(40, 1, 3, 1048);
-    assert_images(&scene.render(device), &scene.reference());
+    for (grouping, summation) in [
+        (TileBinning::Sorting, GradientReduction::Atomics),
+        (TileBinning::Sorting, GradientReduction::Entries),
+        (TileBinning::Counting, GradientReduction::Atomics),
+    ] {
+        let (params, mut raster) = scene.upload_for(device, DeviceChoices { grouping, summation });
+        raster.forward(&params, &scene.options).unwrap();
+        assert_images(&rendered(&raster), &scene.reference());
+    }
 }
 
 /// No splat, one, none in view, fewer pixels than a tile, and lists that have to grow.
@@ -170,6 +178,28 @@ pub fn fused_update(device: &Device) {
 pub fn lists_by_counting(device: &Device) {
     let (total, extra) = assert_lists(device, &scene(60, 0, 0, 1044));
     assert!(total > 50 && extra * 20 < total, "{extra} of {total}");
+}
+
+/// As [`lists_by_counting`], with several chunks of splats, and with splats of every size: those of
+/// a thread, of a subgroup and of the whole device.
+pub fn lists_by_sorting(device: &Device) {
+    assert_lists(device, &scene(600, 0, 0, 1054));
+    let (mut splats, camera) = seeded::small(40, 150, 140, 0, 1055);
+    let mut random = Random::new(1055);
+    for (scales, logit) in splats.log_scales.iter_mut().zip(&mut splats.opacity_logits) {
+        *scales = [0; 3].map(|_| random.between(-3.0, 1.0) as f32);
+        *logit = 0.0;
+    }
+    let scene = Scene::new(splats, &camera, 0, 1055);
+    let forward = scene.reference();
+    let lists = bin::reference(&forward.projected, &forward.order, scene.view.size);
+    let tiles_of = |i: usize| lists.iter().flatten().filter(|&&splat| splat as usize == i).count();
+    let sizes: Vec<usize> = (0..40).map(tiles_of).collect();
+    let number =
+        |sizes: &[usize], range: std::ops::Range<usize>| sizes.iter().filter(|n| range.contains(n)).count();
+    let numbers = [1..33, 33..257, 257..1000].map(|range| number(&sizes, range));
+    assert!(numbers.iter().all(|&n| n > 3), "{numbers:?}");
+    assert_lists(device, &scene);
 }
 
 pub fn pairs(device: &Device) {

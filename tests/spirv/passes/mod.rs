@@ -23,6 +23,7 @@ pub const PLAIN: &[(&str, Scene)] = &[
     ("SH gradients in shared memory", frames::sh_shared),
     ("fused update", frames::fused_update),
     ("lists by counting", frames::lists_by_counting),
+    ("lists by sorting", frames::lists_by_sorting),
     ("edge cases", frames::edge_cases),
     ("pairs", frames::pairs),
     ("decode", frames::decode),
