@@ -34,11 +34,10 @@ const uint THREADS = SUBGROUPS * SUBGROUP_SIZE;
 const uint TILE = 2048;
 const uint PAIRS_PER_THREAD = TILE / THREADS;
 const uint DIGITS_PER_THREAD = (255u + THREADS) / THREADS;
-// Predecessors that a thread polls at once, since one poll after the other would wait for memory
-// each time. Tiles that all run at once publish their aggregates at about the same time, so that
-// one must look at many; of more tiles, many have their prefix soon, and polls are atomic accesses.
-const uint MOST_POLLS = 16, POLLS = 4;
-const uint FEW_TILES = 128; // about the number of multiprocessors of a large GPU
+// A thread polls several predecessors at once, since one poll after the other would wait for memory
+// each time: tiles that all run at once publish their aggregates at about the same time. Polls are
+// atomic accesses, so that the more tiles there are, the fewer each one polls.
+const uint LEAST_POLLS = 4, MOST_POLLS = 16, ALL_POLLS = 4096;
 
 shared uint next_tile;
 shared uint counters[SUBGROUPS * 256]; // per subgroup and digit: counts, then offsets in the tile
@@ -106,7 +105,7 @@ void main() {
     for (uint k = 0u; k < DIGITS_PER_THREAD; k++) {
         everywhere[k] = zeros[first_digit + pass * 256u + min(k * THREADS + thread, 255u)];
     }
-    uint polls = end <= FEW_TILES * TILE ? MOST_POLLS : POLLS;
+    uint polls = clamp(ALL_POLLS * TILE / max(end, 1u), LEAST_POLLS, MOST_POLLS);
     barrier();
     uint tile = next_tile;
     uint first = tile * TILE;
@@ -148,7 +147,11 @@ void main() {
                 counters[s * 256u + digit] = total;
                 total += here;
             }
-            atomicOr(zeros[statuses + tile * 256u + digit], (tile == 0u ? FLAG_INCLUSIVE : FLAG_AGGREGATE) | total);
+            // Nobody asks for a digit that no pair has.
+            if (everywhere[k] > 0u) {
+                uint flag = tile == 0u ? FLAG_INCLUSIVE : FLAG_AGGREGATE;
+                atomicOr(zeros[statuses + tile * 256u + digit], flag | total);
+            }
             starts[k] = uvec2(subgroupExclusiveAdd(counted(total)), subgroupExclusiveAdd(everywhere[k]));
             if (lane == SUBGROUP_SIZE - 1u) {
                 chunk_sums[digit / SUBGROUP_SIZE] = starts[k] + uvec2(total, everywhere[k]);
@@ -172,7 +175,7 @@ void main() {
     }
     for (uint k = 0u; k < DIGITS_PER_THREAD; k++) {
         uint digit = k * THREADS + thread;
-        if (digit < 256u) {
+        if (digit < 256u && everywhere[k] > 0u) {
             uint prefix = look_back(statuses, tile, digit, polls);
             // FLAG_AGGREGATE | aggregate becomes FLAG_INCLUSIVE | (prefix + aggregate).
             if (tile > 0u) atomicAdd(zeros[statuses + tile * 256u + digit], FLAG_AGGREGATE + prefix);

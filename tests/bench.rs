@@ -5,7 +5,8 @@ use splatlab::generate::regions::InjectedErrors;
 use splatlab::generate::{Effects, SceneSpec, generate};
 use splatvk::bench::report::{Clock, SUM};
 use splatvk::bench::{Bench, BenchReport, Budget, Quartiles, Section, Workload, compare};
-use splatvk::gpu::{self, TestDevice, test_device};
+use splatvk::gpu::{self, Options, TestDevice, test_device};
+use splatvk::pass::KernelVariant;
 use splatvk::progress::Silent;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -70,6 +71,22 @@ fn bench_training_times_add_up() {
     let text = bench.report.table();
     for word in ["copy bandwidth", "fused multiply-add rate", "raster backward", "evaluated / blended"] {
         assert!(text.contains(word), "{word} is not in\n{text}");
+    }
+}
+
+/// As on a GPU.
+#[test]
+fn bench_measures_fused_update() {
+    let disabled = [KernelVariant::SeparateUpdate.name().to_owned()].into();
+    let device = TestDevice::open(&Options { disabled, ..gpu::options(None) }).unwrap();
+    let mut bench = Bench::new(&device, ONCE).unwrap();
+    bench.training(&Workload::seeded(400, 75, 53, 1, 0).unwrap(), 5).unwrap();
+    let forward = ["projection", "depth sort", "binning", "raster forward", "SSIM + L1"];
+    let colour = ["regularisers", "raster backward", "projection backward + Adam"];
+    let features =
+        ["feature loss", "raster backward", "projection backward + Adam", "feature backward", "Adam"];
+    for (name, back) in [("training step", &colour[..]), ("training step, 5 features", &features)] {
+        check_step(bench.report.section(name).unwrap(), &[forward.as_slice(), back].concat());
     }
 }
 

@@ -150,7 +150,7 @@ fn record_sorting(rec: &mut Recorder, frame: &FrameBuffers, rows: &Range<u32>, c
     );
     // At least one workgroup, which writes the number of entries.
     rec.dispatch(call, rows_of_groups((count as usize).div_ceil(CHUNK_SPLATS)));
-    let most = capacity / shaders::bin_sweep::LARGE as u32;
+    let most = capacity / shaders::bin_sweep::LARGE;
     let call = shaders::bin_large::call(
         shaders::bin_large::Variant { indexed },
         &shaders::bin_large::Bindings {
