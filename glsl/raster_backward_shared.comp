@@ -29,6 +29,7 @@ layout(push_constant) uniform Push {
 };
 
 #define SHARED_SPLATS 1
+#define SHARED_BATCHES 1
 #include "shared/raster.glsl"
 
 // A group of splats is evaluated pixel by pixel; then each lane sums one splat over one part of the

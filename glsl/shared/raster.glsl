@@ -30,6 +30,11 @@
 #ifndef SHARED_SPLATS
 #define SHARED_SPLATS (SUBGROUP_SIZE >= 32)
 #endif
+// Batches in shared memory. With two, a lane that is ahead writes the next batch while others still
+// read this one. One is enough for a shader with a barrier behind its last read.
+#ifndef SHARED_BATCHES
+#define SHARED_BATCHES 2
+#endif
 
 // (splat, entry) of this lane in the batch.
 uvec2 own_item;
@@ -37,9 +42,8 @@ uvec2 own_item;
 #if SHARED_SPLATS
 #define VALUE_VECTORS ((CHANNELS + 3) / 4)
 #define SPLAT_VECTORS (2 + VALUE_VECTORS)
-// Values of the geometry and of the channels, of this batch and of the one before: a lane that is
-// ahead writes the next batch while others still read this one.
-shared vec4 splats[2 * SPLAT_VECTORS * SUBGROUP_SIZE];
+// Values of the geometry and of the channels.
+shared vec4 splats[SHARED_BATCHES * SPLAT_VECTORS * SUBGROUP_SIZE];
 uint batch_start = 0; // vectors
 // The next batch is on its way from memory while the lanes blend this one.
 uvec2 next_item;
@@ -71,7 +75,7 @@ void begin_batches(uint first, uint last, uint lane) {
 void load_batch(uint j, uint last, uint lane) {
     own_item = next_item;
     if (j + lane >= last) next_splat[1].y = -1e4;
-    batch_start = SPLAT_VECTORS * SUBGROUP_SIZE - batch_start;
+    batch_start = (SHARED_BATCHES - 1) * SPLAT_VECTORS * SUBGROUP_SIZE - batch_start;
     [[unroll]] for (int k = 0; k < SPLAT_VECTORS; k++)
         splats[batch_start + SPLAT_VECTORS * lane + k] = next_splat[k];
     fetch(j + SUBGROUP_SIZE + lane, last);

@@ -60,14 +60,13 @@ pub fn without_barriers(sizes: &[usize]) -> usize {
 fn scene_of(family: &str, module: &Module) -> Scene {
     let name = match family {
         "scan_lanes" => "scan",
-        "raster_forward" | "raster_backward" => match module.variant[0] {
+        "raster_forward" => match module.variant[0] {
             4 => "colours",
             7 => "3 features",
             12 => "8 features",
             _ => "21 features",
         },
         "raster_backward_shared" => "tile sums in shared memory",
-        "raster_backward_entries" => "gradients by entry",
         "count_pairs" => "pairs",
         "bin_sweep" | "bin_large" => "lists by sorting",
         "sum" => "sum",
@@ -94,9 +93,8 @@ fn missing_barrier_is_race() {
     // of camera_sum, 1 of each degree of project_backward per thread, 3 of each degree with shared
     // memory and of fused_update, and in two variants 4 of bin_sweep and 2 of bin_large.
     let arrays = 10 + 5 + 1 + 4 + 12 + 12 + 12;
-    // 1 of each of 5 variants of raster_forward and raster_backward_entries, of 10 of
-    // raster_backward and of count_pairs.
-    let batches = 5 + 5 + 10 + 1;
+    // 1 of each of 5 variants of raster_forward and of count_pairs.
+    let batches = 5 + 1;
     // 4 of each of two variants of raster_backward_shared.
     assert_eq!(without_barriers(&[32]), arrays + batches + 8);
 }
@@ -105,7 +103,7 @@ fn missing_barrier_is_race() {
 #[test]
 #[ignore = "takes long: tools/test-long"]
 fn missing_barrier_is_race_everywhere() {
-    assert_eq!(without_barriers(&[4, 8, 16, 32, 64]), 5 * (56 + 8) + 2 * 21);
+    assert_eq!(without_barriers(&[4, 8, 16, 32, 64]), 5 * (56 + 8) + 2 * 6);
 }
 
 /// A barrier that orders memory of another kind.

@@ -35,7 +35,8 @@ pub fn image(device: &Device) {
         (TileBinning::Sorting, GradientReduction::Entries),
         (TileBinning::Counting, GradientReduction::Atomics),
     ] {
-        let (params, mut raster) = scene.upload_for(device, DeviceChoices { grouping, summation });
+        let (params, mut raster) =
+            scene.upload_for(device, DeviceChoices { grouping, summation, ..DeviceChoices::of(device) });
         raster.forward(&params, &scene.options).unwrap();
         assert_images(&rendered(&raster), &scene.reference());
     }
