@@ -1,5 +1,7 @@
 //! Options of a device from the environment.
 use super::folder::FolderCache;
+use crate::Error;
+use crate::pass::KernelVariant;
 use splatvk_gpu::{Cache, Device, Options};
 use std::sync::Arc;
 
@@ -7,9 +9,22 @@ use std::sync::Arc;
 /// its name.
 ///
 /// # Errors
-/// Those of [`Device::open`].
+/// Those of [`Device::open`], and where `SPLATVK_DISABLE` names no kernel variant.
 pub fn open(choice: Option<&str>) -> crate::Result<Device> {
-    Ok(Device::open(&options(choice))?)
+    let options = options(choice);
+    check_disabled(&options)?;
+    Ok(Device::open(&options)?)
+}
+
+fn check_disabled(options: &Options) -> crate::Result<()> {
+    let known = KernelVariant::ALL.map(KernelVariant::name);
+    match options.disabled.iter().find(|name| !known.contains(&name.as_str())) {
+        None => Ok(()),
+        Some(name) => Err(Error::input(format!(
+            "SPLATVK_DISABLE: no kernel variant is called `{name}`; they are {}",
+            known.join(", ")
+        ))),
+    }
 }
 
 /// Options from the environment. The device is `choice`, or else `SPLATVK_DEVICE`.
@@ -34,5 +49,22 @@ pub fn options(choice: Option<&str>) -> Options {
             .unwrap_or_default(),
         cache: FolderCache::own().map(|cache| Arc::new(cache) as Arc<dyn Cache>),
         ..Options::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unknown_variants_are_refused() {
+        let named = |names: &[&str]| Options {
+            disabled: names.iter().map(|n| (*n).to_owned()).collect(),
+            ..Options::default()
+        };
+        check_disabled(&named(&[])).unwrap();
+        check_disabled(&named(&KernelVariant::ALL.map(KernelVariant::name))).unwrap();
+        let e = check_disabled(&named(&["sort in one sweep", "fused"])).unwrap_err().to_string();
+        assert!(e.contains("`fused`") && e.contains("update in one pass"), "{e}");
     }
 }
