@@ -1,8 +1,8 @@
 #version 450
-// Grouping by counting: writes the entries, for every splat in depth order its tiles, row by row. All lanes write the
-// same number of entries, so many lanes share a splat that covers the screen. If the entries do not
-// fit, none is written and the status holds the number needed: the image then has no splats at all,
-// never a few missing. Reference: pass::bin.
+// Grouping by counting: writes the entries, for every splat in depth order its tiles, row by row.
+// All lanes write the same number of entries, so many lanes share a splat that covers the screen.
+// If the entries do not fit, none is written and the status holds the number needed: the image then
+// has no splats at all, never a few missing. Reference: pass::bin.
 //
 // Rows of tiles from first_row up to end_row of the image are binned; tile 0 is the first of these.
 //

@@ -86,7 +86,8 @@ uint tiles_of(uint splat, Ellipse e) {
         uint leader = lowest(left);
         Ellipse other = ellipse_of(subgroupShuffle(splat, leader), first_row, end_row);
         uint part = 0u;
-        for (int row = other.first_row + int(gl_SubgroupInvocationID); row <= other.last_row; row += SUBGROUP_SIZE) {
+        int first = other.first_row + int(gl_SubgroupInvocationID);
+        for (int row = first; row <= other.last_row; row += SUBGROUP_SIZE) {
             part += width_of(interval_of(other, row, tiles_x));
         }
         uint total = subgroupAdd(counted(part));
@@ -206,7 +207,9 @@ void main() {
             int row = e.first_row - 1;
             ivec2 interval = ivec2(0, -1);
             for (uint k = 0u; k < counts[b]; k++) {
-                while (interval.x > interval.y && row < e.last_row) interval = interval_of(e, ++row, tiles_x);
+                while (interval.x > interval.y && row < e.last_row) {
+                    interval = interval_of(e, ++row, tiles_x);
+                }
                 write_entry(first + k, row, interval.x++, splats[b]);
             }
         } else if (counts[b] > LARGE) {
@@ -216,7 +219,8 @@ void main() {
         bool wide = counts[b] > WIDE && counts[b] <= LARGE;
         for (LaneSet left = lanes_where(wide); !is_empty(left); left = without_lowest(left)) {
             uint leader = lowest(left);
-            write_by_subgroup(subgroupShuffle(splats[b], leader), subgroupShuffle(first, leader), 0u, 1u);
+            uint splat = subgroupShuffle(splats[b], leader), at = subgroupShuffle(first, leader);
+            write_by_subgroup(splat, at, 0u, 1u);
         }
 #if INDEXED
         uint rank = first_rank + b * SUBGROUP_SIZE;
