@@ -1,5 +1,6 @@
 //! Fine over-segmentation: graph merging after Felzenszwalb and Huttenlocher (IJCV 2004).
 use crate::scene::Image;
+use rayon::prelude::*;
 
 /// Disjoint sets of pixels with size and internal difference.
 struct Forest {
@@ -56,7 +57,8 @@ pub fn superpixels(
             }
         }
     }
-    edges.sort_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
+    // No two edges compare equal.
+    edges.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then((a.1, a.2).cmp(&(b.1, b.2))));
     let mut forest =
         Forest { parent: (0..count as u32).collect(), size: vec![1; count], threshold: vec![scale; count] };
     for &(w, p, q) in &edges {

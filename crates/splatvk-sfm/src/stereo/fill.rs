@@ -33,30 +33,32 @@ const HALF_CONFIDENCE_COST: f32 = 0.5;
 /// Rejects consistent pixels within `radius` of a depth step: there the matching window mixes two
 /// surfaces, and filling locates the colour edge more exactly.
 pub fn without_depth_edges(level: &Level, surface: &Surface, radius: usize) -> Surface {
-    let mut out = surface.clone();
-    for (view, r) in level.references.iter().enumerate() {
-        let (width, height, first) = (r.width as usize, r.height as usize, r.first as usize);
-        let depth = super::surface::depth(level, view, surface);
-        for y in 0..height {
-            for x in 0..width {
-                let z = depth.at(x, y);
-                let step = neighbours(y * width + x, width, height).any(|n| {
-                    z > 0.0
-                        && depth.data[n] > 0.0
-                        && (depth.data[n] - z).abs() > free_space_tolerance(level, view) * z
-                });
-                if !step {
-                    continue;
-                }
-                for py in y.saturating_sub(radius)..(y + radius + 1).min(height) {
-                    for px in x.saturating_sub(radius)..(x + radius + 1).min(width) {
-                        out.confidence[first + py * width + px] = 0.0;
-                    }
-                }
+    let of_view = |view| confidence_off_edges(level, surface, view, radius);
+    let confidence = (0..level.references.len()).into_par_iter().flat_map_iter(of_view).collect();
+    Surface { planes: surface.planes.clone(), confidence }
+}
+
+/// Confidence of the pixels of one view, 0 near its depth steps.
+fn confidence_off_edges(level: &Level, surface: &Surface, view: usize, radius: usize) -> Vec<f32> {
+    let r = &level.references[view];
+    let (width, height, first) = (r.width as usize, r.height as usize, r.first as usize);
+    let depth = super::surface::depth(level, view, surface);
+    let tolerance = free_space_tolerance(level, view);
+    let mut confidence = surface.confidence[first..first + width * height].to_vec();
+    for y in 0..height {
+        for x in 0..width {
+            let z = depth.at(x, y);
+            let differs = |n: usize| depth.data[n] > 0.0 && (depth.data[n] - z).abs() > tolerance * z;
+            if z <= 0.0 || !neighbours(y * width + x, width, height).any(differs) {
+                continue;
+            }
+            for py in y.saturating_sub(radius)..(y + radius + 1).min(height) {
+                let row = py * width;
+                confidence[row + x.saturating_sub(radius)..row + (x + radius + 1).min(width)].fill(0.0);
             }
         }
     }
-    out
+    confidence
 }
 
 /// Assigns a plane to every pixel that is not void. `surface` holds the consistent pixels, with
@@ -119,19 +121,13 @@ impl<'a> ViewFill<'a> {
         let mut best = vec![f32::INFINITY; pixels];
         let consistent: Vec<u32> =
             (0..pixels as u32).filter(|&k| self.surface.confidence[self.first + k as usize] > 0.0).collect();
-        let local = self.propagate(&consistent, None, None);
         let plane_of = |source: usize| self.surface.planes[self.first + source];
+        let (local, extended) = rayon::join(
+            || self.propagate(&consistent, None, None),
+            || large.par_iter().map(|plane| self.extend(plane, &consistent)).collect::<Vec<_>>(),
+        );
         self.take_cheaper(&local, LOCAL_FACTOR, plane_of, &mut best, &mut planes);
-        for plane in large {
-            let Some(plane) = plane.in_camera(&self.level.cameras[self.view]) else { continue };
-            let on: Vec<u32> =
-                consistent.iter().copied().filter(|&k| self.lies_on(k as usize, plane)).collect();
-            // A few pixels that touch the plane by chance must not extend it over the image.
-            if on.len() * 1000 < pixels {
-                continue;
-            }
-            let colours = ColourModel::new(&self.level.guide[self.view], &on, &consistent);
-            let paths = self.propagate(&on, Some(plane), Some(&colours));
+        for (plane, paths) in extended.into_iter().flatten() {
             self.take_cheaper(&paths, 1.0, |_| plane, &mut best, &mut planes);
         }
         for k in 0..pixels {
@@ -142,6 +138,19 @@ impl<'a> ViewFill<'a> {
             }
         }
         (planes, confidence)
+    }
+
+    /// Paths of a large plane, in the camera's frame, from the `consistent` pixels on it; `None`
+    /// where these are too few.
+    fn extend(&self, plane: &WorldPlane, consistent: &[u32]) -> Option<(Vec3, Paths)> {
+        let plane = plane.in_camera(&self.level.cameras[self.view])?;
+        let on: Vec<u32> = consistent.iter().copied().filter(|&k| self.lies_on(k as usize, plane)).collect();
+        // A few pixels that touch the plane by chance must not extend it over the image.
+        if on.len() * 1000 < self.width * self.height {
+            return None;
+        }
+        let colours = ColourModel::new(&self.level.guide[self.view], &on, consistent);
+        Some((plane, self.propagate(&on, Some(plane), Some(&colours))))
     }
 
     /// Assigns the planes of paths whose cost times `factor` is below the best so far.
@@ -208,10 +217,14 @@ impl<'a> ViewFill<'a> {
                 if inverse < 0.5 * far || inverse > 2.0 * near {
                     continue;
                 }
-                let evidence = self.evidence(n, candidate);
                 // Up to three times the cost for other colours, a tenth for the plane's own.
                 let foreign =
                     colours.map_or(1.0, |c| FOREIGN_COLOUR * (1.0 - c.share(b)).powi(2) + OWN_COLOUR);
+                // Evidence lowers the cost by this factor at most.
+                if here + (STEP + difference) * CONFIRMED * foreign >= cost[n] {
+                    continue;
+                }
+                let evidence = self.evidence(n, candidate);
                 let total = here + (STEP + difference) * evidence.0 * foreign + evidence.1;
                 if total < cost[n] {
                     cost[n] = total;

@@ -3,6 +3,8 @@ use super::Level;
 use super::surface::{RelativePoses, Surface, neighbours, ray};
 use crate::scene::PointCloud;
 use glam::Vec3;
+use rayon::prelude::*;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Relative depth step to a neighbour above which a pixel may float between two surfaces.
 const FLYING: f32 = 0.06;
@@ -44,31 +46,37 @@ fn fuse_view(
     let r = &level.references[view];
     let (width, height) = (r.width as usize, r.height as usize);
     let depth = super::surface::depth(level, view, surface);
-    let mut covered = vec![false; width * height];
-    for (other, points) in kept {
-        for &point in points {
-            let Some((u, v, z)) = poses.project(level, *other, view, point) else { continue };
-            let (x, y) = (u as usize, v as usize);
-            // A kept point covers 3 × 3 pixels, so that no gaps arise in a closer view.
-            for py in y.saturating_sub(1)..(y + 2).min(height) {
-                for px in x.saturating_sub(1)..(x + 2).min(width) {
-                    let here = depth.at(px, py);
-                    if (here - z).abs() < level.tolerance[view] * here {
-                        covered[py * width + px] = true;
-                    }
+    // The order in which points cover pixels does not matter.
+    let covered: Vec<AtomicBool> = (0..width * height).map(|_| AtomicBool::new(false)).collect();
+    let cover = |other: usize, point: Vec3| {
+        let Some((u, v, z)) = poses.project(level, other, view, point) else { return };
+        let (x, y) = (u as usize, v as usize);
+        // A kept point covers 3 × 3 pixels, so that no gaps arise in a closer view.
+        for py in y.saturating_sub(1)..(y + 2).min(height) {
+            for px in x.saturating_sub(1)..(x + 2).min(width) {
+                let here = depth.at(px, py);
+                if (here - z).abs() < level.tolerance[view] * here {
+                    covered[py * width + px].store(true, Ordering::Relaxed);
                 }
             }
         }
+    };
+    for (other, points) in kept {
+        points.par_iter().with_min_len(1024).for_each(|point| cover(*other, *point));
     }
+    let is_new = |k: &usize| {
+        let (z, confidence) = (depth.data[*k], surface.confidence[r.first as usize + k]);
+        z > 0.0
+            && (confidence >= MATCHED) == matched
+            && !covered[*k].load(Ordering::Relaxed)
+            && !neighbours(*k, width, height)
+                .any(|n| depth.data[n] > 0.0 && (depth.data[n] - z).abs() > FLYING * z)
+    };
+    let new: Vec<usize> = (0..width * height).into_par_iter().with_min_len(1024).filter(is_new).collect();
     let to_world = level.cameras[view].pose.inverse();
-    let mut added = Vec::new();
-    for k in 0..width * height {
+    let mut added = Vec::with_capacity(new.len());
+    for k in new {
         let (z, confidence) = (depth.data[k], surface.confidence[r.first as usize + k]);
-        let flying = neighbours(k, width, height)
-            .any(|n| depth.data[n] > 0.0 && (depth.data[n] - z).abs() > FLYING * z);
-        if z <= 0.0 || covered[k] || flying || (confidence >= MATCHED) != matched {
-            continue;
-        }
         let point = ray(level, view, k % width, k / width) * z;
         added.push(point);
         cloud.positions.push(to_world.transform(point.as_dvec3()).as_vec3().to_array());

@@ -23,6 +23,7 @@ use crate::Result;
 use crate::progress::Progress;
 use crate::scene::{Camera, Coverage, DepthMap, DepthPrior, Image, PointCloud, RgbImage};
 use glam::{DVec3, Vec4};
+use rayon::prelude::*;
 
 /// Depth maps and fused points of photos with `cameras` at their working resolutions. Depth is
 /// complete except at white borders and unused pixels. `sparse` are points of the scene in world
@@ -42,12 +43,38 @@ pub fn dense(
 ) -> Result<(Vec<DepthMap>, PointCloud)> {
     let options = &StereoOptions { binding: sweep.binding(), ..options.clone() };
     let levels = pyramid(images, cameras, sparse, options)?;
-    let planes = run_schedule(&levels, options, progress, |level, start| {
-        sweep.matcher(&level.luma, &level.references, &level.sources, &start)
-    })?;
-    progress.check()?;
     let finest = &levels[levels.len() - 1];
-    Ok(finish(images, coverage, finest, &planes, priors, options, progress))
+    // The segmentation needs no depth, so it runs while the device matches.
+    let (planes, segments) = std::thread::scope(|scope| {
+        let segments = scope.spawn(|| PhotoSegments::new(finest, coverage));
+        let planes = run_schedule(&levels, options, progress, |level, start| {
+            sweep.matcher(&level.luma, &level.references, &level.sources, &start)
+        });
+        // A panic of the other thread continues in this one.
+        (planes, segments.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+    });
+    let planes = planes?;
+    progress.check()?;
+    Ok(finish(images, coverage, finest, &segments, &planes, priors, options, progress))
+}
+
+/// Areas of the photos at one resolution, found without depth.
+pub struct PhotoSegments {
+    /// Pixels that are neither matched nor filled.
+    void: Vec<bool>,
+    /// Pixels of weak texture.
+    weak: Vec<bool>,
+    /// Areas of even colour, per view.
+    areas: Vec<regions::Segmentation>,
+}
+
+impl PhotoSegments {
+    /// Segments all views of a level; `coverage` has an entry per view or none.
+    pub fn new(level: &Level, coverage: &[Option<Coverage>]) -> PhotoSegments {
+        let weak = texture::weak(level);
+        let areas = regions::segment(level, &weak);
+        PhotoSegments { void: void::unused(level, coverage), weak, areas }
+    }
 }
 
 /// Planes (π, cost) of all views at the finest resolution; `matcher` makes a level's matcher.
@@ -108,29 +135,43 @@ pub fn finish(
     images: &[RgbImage],
     coverage: &[Option<Coverage>],
     level: &Level,
+    segments: &PhotoSegments,
     matched: &[Vec4],
     priors: &[Option<DepthPrior>],
     options: &StereoOptions,
     progress: &dyn Progress,
 ) -> (Vec<DepthMap>, PointCloud) {
-    let void = void::unused(level, coverage);
-    let weak = texture::weak(level);
+    progress.begin("surfaces", SURFACE_STEPS);
+    let PhotoSegments { void, weak, areas } = segments;
     let poses = surface::RelativePoses::new(level);
-    let consistent = surface::consistent_surface(level, &poses, matched, &void, &weak);
+    let consistent = surface::consistent_surface(level, &poses, matched, void, weak);
+    progress.step(1, "planes");
     let fitted = surface::smoothed(level, &consistent, FIT_RADIUS);
-    let large = planes::large_planes(level, &fitted, options.seed);
-    let trimmed = fill::without_depth_edges(level, &fitted, depth_edge_radius(level));
-    let inferred = regions::fill(level, &poses, &trimmed, &void, &weak, options.seed);
+    let (large, inferred) = rayon::join(
+        || planes::large_planes(level, &fitted, options.seed),
+        || {
+            let trimmed = fill::without_depth_edges(level, &fitted, depth_edge_radius(level));
+            progress.step(2, "regions");
+            regions::fill(level, &poses, &trimmed, void, areas, options.seed)
+        },
+    );
     let fused = prior::fuse_priors(level, &poses, &inferred, priors, options.seed, progress);
-    let complete = fill::fill(level, &poses, &fused, &large, &void);
+    progress.step(3, "filling");
+    let complete = fill::fill(level, &poses, &fused, &large, void);
+    progress.step(4, "points");
     let points = fuse::fuse(level, &poses, &complete);
     let mut depths: Vec<DepthMap> =
-        images.iter().enumerate().map(|(view, image)| depth_map(level, &complete, view, image)).collect();
+        images.par_iter().enumerate().map(|(view, image)| depth_map(level, &complete, view, image)).collect();
     for (depth, coverage) in depths.iter_mut().zip(coverage) {
         coverage.iter().for_each(|c| depth.keep(|i| c.uses(i)));
     }
+    progress.step(SURFACE_STEPS, "");
+    progress.end();
     (depths, points)
 }
+
+/// Steps of the progress bar: consistency, planes, regions, filling, points.
+const SURFACE_STEPS: u64 = 5;
 
 /// Radius of the plane fit, pixels: averages the matching noise of one window over 11 × 11.
 const FIT_RADIUS: i32 = 5;

@@ -6,6 +6,7 @@ use crate::math::hash;
 use crate::scene::Camera;
 use glam::{DMat3, DVec3, Vec3};
 use nalgebra::{Matrix3, SymmetricEigen};
+use rayon::prelude::*;
 
 /// `normal · X = offset` in world coordinates.
 #[derive(Clone, Copy, Debug)]
@@ -53,12 +54,17 @@ pub fn large_planes(level: &Level, surface: &Surface, seed: u32) -> Vec<WorldPla
     let mut planes = Vec::new();
     let mut state = seed;
     while planes.len() < MAX_PLANES && samples.len() >= 100 {
-        let mut best = (0, WorldPlane { normal: DVec3::Z, offset: 0.0 });
-        for _ in 0..TRIALS {
+        let mut draw = || {
             state = hash(state);
             let s = &samples[state as usize % samples.len()];
-            let plane = WorldPlane { normal: s.normal, offset: s.normal.dot(s.position) };
-            let count = samples.iter().filter(|s| lies_on(&plane, s)).count();
+            WorldPlane { normal: s.normal, offset: s.normal.dot(s.position) }
+        };
+        let drawn: Vec<WorldPlane> = (0..TRIALS).map(|_| draw()).collect();
+        let count = |plane: &WorldPlane| samples.iter().filter(|s| lies_on(plane, s)).count();
+        let counts: Vec<usize> = drawn.par_iter().map(count).collect();
+        // The first of the planes with the most points.
+        let mut best = (0, WorldPlane { normal: DVec3::Z, offset: 0.0 });
+        for (count, plane) in counts.into_iter().zip(drawn) {
             if count > best.0 {
                 best = (count, plane);
             }

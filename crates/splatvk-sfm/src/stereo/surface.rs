@@ -156,6 +156,14 @@ pub fn ray(level: &Level, view: usize, x: usize, y: usize) -> Vec3 {
     Vec3::new((x as f32 + 0.5 - cx) / fx, (y as f32 + 0.5 - cy) / fy, 1.0)
 }
 
+/// The x of [`ray`] per column of a view and its y per row.
+fn rays(level: &Level, view: usize) -> (Vec<f32>, Vec<f32>) {
+    let r = &level.references[view];
+    let x = |column| ray(level, view, column, 0).x;
+    let y = |row| ray(level, view, 0, row).y;
+    ((0..r.width as usize).map(x).collect(), (0..r.height as usize).map(y).collect())
+}
+
 /// Results of `f(view, x, y, index)` in parallel for all pixels of all views, in buffer order.
 pub fn map_pixels<T: Send>(level: &Level, f: impl Fn(usize, usize, usize, usize) -> T + Sync) -> Vec<T> {
     let mut out = Vec::with_capacity(level.pixels());
@@ -272,51 +280,58 @@ pub fn depth(level: &Level, view: usize, surface: &Surface) -> Image<f32> {
     let r = &level.references[view];
     let (width, height) = (r.width as usize, r.height as usize);
     let mut out = Image::filled(width, height, 0.0);
-    for y in 0..height {
-        for x in 0..width {
+    out.data.par_chunks_mut(width.max(1)).enumerate().for_each(|(y, row)| {
+        for (x, depth) in row.iter_mut().enumerate() {
             let k = r.first as usize + y * width + x;
             let inverse = surface.planes[k].dot(ray(level, view, x, y));
             if surface.confidence[k] > 0.0 && inverse > 0.0 {
-                out.data[y * width + x] = 1.0 / inverse;
+                *depth = 1.0 / inverse;
             }
         }
-    }
+    });
     out
 }
 
 /// Rejects small areas of connected depth.
 fn remove_speckles(level: &Level, surface: &mut Surface) {
-    for view in 0..level.cameras.len() {
-        let depth = depth(level, view, surface);
-        let smallest = (SPECKLE_SHARE * depth.data.len() as f32) as usize;
-        let mut done = vec![false; depth.data.len()];
-        let mut area = Vec::new();
-        for start in 0..depth.data.len() {
-            if done[start] || depth.data[start] <= 0.0 {
-                continue;
-            }
-            area.clear();
-            area.push(start);
-            done[start] = true;
-            let mut next = 0;
-            while next < area.len() {
-                let k = area[next];
-                next += 1;
-                for n in neighbours(k, depth.width, depth.height) {
-                    let (a, b) = (depth.data[k], depth.data[n]);
-                    if !done[n] && b > 0.0 && (a - b).abs() < free_space_tolerance(level, view) * a {
-                        done[n] = true;
-                        area.push(n);
-                    }
-                }
-            }
-            if area.len() < smallest {
-                for &k in &area {
-                    surface.confidence[level.references[view].first as usize + k] = 0.0;
+    let views = 0..level.cameras.len();
+    let of_view = |view| speckles(level, view, surface);
+    for k in views.into_par_iter().flat_map_iter(of_view).collect::<Vec<_>>() {
+        surface.confidence[k] = 0.0;
+    }
+}
+
+/// Pixels of the small areas of connected depth of one view.
+fn speckles(level: &Level, view: usize, surface: &Surface) -> Vec<usize> {
+    let depth = depth(level, view, surface);
+    let (first, tolerance) = (level.references[view].first as usize, free_space_tolerance(level, view));
+    let smallest = (SPECKLE_SHARE * depth.data.len() as f32) as usize;
+    let mut done = vec![false; depth.data.len()];
+    let (mut area, mut rejected) = (Vec::new(), Vec::new());
+    for start in 0..depth.data.len() {
+        if done[start] || depth.data[start] <= 0.0 {
+            continue;
+        }
+        area.clear();
+        area.push(start);
+        done[start] = true;
+        let mut next = 0;
+        while next < area.len() {
+            let k = area[next];
+            next += 1;
+            for n in neighbours(k, depth.width, depth.height) {
+                let (a, b) = (depth.data[k], depth.data[n]);
+                if !done[n] && b > 0.0 && (a - b).abs() < tolerance * a {
+                    done[n] = true;
+                    area.push(n);
                 }
             }
         }
+        if area.len() < smallest {
+            rejected.extend(area.iter().map(|k| first + k));
+        }
     }
+    rejected
 }
 
 /// Up to four direct neighbours of a pixel index.
@@ -335,13 +350,14 @@ pub fn neighbours(k: usize, width: usize, height: usize) -> impl Iterator<Item =
 /// Smooths each consistent pixel: a least-squares plane, in inverse depth (affine over the image),
 /// of the consistent pixels within `radius` that lie on its plane.
 pub fn smoothed(level: &Level, surface: &Surface, radius: i32) -> Surface {
+    let inverses = map_pixels(level, |view, x, y, k| surface.planes[k].dot(ray(level, view, x, y)));
+    let rays: Vec<(Vec<f32>, Vec<f32>)> = (0..level.references.len()).map(|v| rays(level, v)).collect();
     let planes = map_pixels(level, |view, x, y, k| {
         if surface.confidence[k] <= 0.0 {
             return surface.planes[k];
         }
-        let r = &level.references[view];
-        let plane = surface.planes[k];
-        let inverse = plane.dot(ray(level, view, x, y));
+        let (r, (columns, rows)) = (&level.references[view], &rays[view]);
+        let (plane, inverse) = (surface.planes[k], inverses[k]);
         // Normal equations of 1/z = a + b dx + c dy, relative to the value at the centre.
         let (mut m, mut rhs) = ([0.0f64; 6], [0.0f64; 3]);
         for dy in -radius..=radius {
@@ -354,8 +370,8 @@ pub fn smoothed(level: &Level, surface: &Surface, radius: i32) -> Surface {
                 if surface.confidence[n] <= 0.0 {
                     continue;
                 }
-                let there = ray(level, view, px as usize, py as usize);
-                let value = surface.planes[n].dot(there);
+                let there = Vec3::new(columns[px as usize], rows[py as usize], 1.0);
+                let value = inverses[n];
                 if (value - plane.dot(there)).abs() > level.tolerance[view] * inverse {
                     continue;
                 }

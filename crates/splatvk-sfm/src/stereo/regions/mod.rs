@@ -16,7 +16,6 @@ use crate::photo::superpixels;
 use crate::scene::RgbImage;
 use glam::Vec3;
 use rayon::prelude::*;
-use std::collections::{BTreeMap, HashSet};
 use votes::{Affine, CELL, CellSet, REACH, Spread, cells, evaluate, extent, plane_at};
 
 /// Confidence of an inferred pixel: it shapes the surface but is no measurement.
@@ -56,24 +55,25 @@ pub fn fill(
     poses: &RelativePoses,
     surface: &Surface,
     void: &[bool],
-    weak: &[bool],
+    segments: &[Segmentation],
     seed: u32,
 ) -> Surface {
-    let views: Vec<View> = (0..level.cameras.len()).map(|v| View::new(level, v, weak)).collect();
+    let views: Vec<View> = segments.iter().enumerate().map(|(v, s)| View::new(level, v, s)).collect();
     let mut out = surface.clone();
-    for k in views.par_iter().flat_map_iter(|v| v.mirror_pixels(surface, seed)).collect::<Vec<_>>() {
+    for k in views.par_iter().flat_map(|v| v.mirror_pixels(surface, seed)).collect::<Vec<_>>() {
         out.confidence[k] = 0.0;
     }
     let matched = out.clone();
+    let areas: Vec<Vec<(&Area, CellSet)>> = views.par_iter().map(|v| v.unmatched_areas(&matched)).collect();
     for _ in 0..ROUNDS {
-        let filled = views.par_iter().flat_map_iter(|v| v.inferred(poses, &matched, &out, void, seed));
+        let filled = views.par_iter().zip(&areas).flat_map(|(v, a)| v.inferred(poses, a, &out, void, seed));
         for (k, plane) in filled.collect::<Vec<_>>() {
             out.planes[k] = plane;
             out.confidence[k] = INFERRED;
         }
         out.confidence = without_contradicted(level, poses, &out);
     }
-    transferred(level, poses, &matched, &out, &views, void)
+    transferred(level, poses, &out, &views, &areas, void)
 }
 
 /// Assigns to unmatched pixels of weak texture the plane on which most views agree, with their own
@@ -81,65 +81,42 @@ pub fn fill(
 fn transferred(
     level: &Level,
     poses: &RelativePoses,
-    matched: &Surface,
     surface: &Surface,
     views: &[View],
+    areas: &[Vec<(&Area, CellSet)>],
     void: &[bool],
 ) -> Surface {
-    let mut out = surface.clone();
-    for view in views {
-        let weak: HashSet<i32> = view.unmatched_areas(matched).map(|((label, _), _)| *label).collect();
-        let is_open = |k: usize| {
-            [0.0, INFERRED].contains(&surface.confidence[view.first + k])
-                && !void[view.first + k]
-                && weak.contains(&view.labels[k])
-        };
-        // Nearest plane of each other view at a pixel.
-        let mut seen: BTreeMap<usize, BTreeMap<usize, Vec3>> = BTreeMap::new();
-        for (other, r) in level.references.iter().enumerate().filter(|(o, _)| *o != view.view) {
-            for p in 0..(r.width * r.height) as usize {
-                let index = r.first as usize + p;
-                if surface.confidence[index] != INFERRED {
-                    continue;
-                }
-                let ray_there = ray(level, other, p % r.width as usize, p / r.width as usize);
-                let point = ray_there / surface.planes[index].dot(ray_there);
-                let Some((u, v, _)) = poses.project(level, other, view.view, point) else { continue };
-                let k = v as usize * view.width + u as usize;
-                let (here, there) = (level.guide[view.view].data[k], level.guide[other].data[p]);
-                let colour_distance = (0..3).map(|c| (here[c] - there[c]).powi(2)).sum::<f32>().sqrt();
-                if is_open(k) && colour_distance < COLOUR_TOLERANCE {
-                    let plane = poses.plane(other, view.view, surface.planes[index]);
-                    let nearest = seen.entry(k).or_default().entry(other).or_insert(plane);
-                    let ray = ray(level, view.view, k % view.width, k / view.width);
-                    if plane.dot(ray) > nearest.dot(ray) {
-                        *nearest = plane;
-                    }
-                }
-            }
+    let of_view = |(view, areas): (&View, &Vec<(&Area, CellSet)>)| -> Vec<(usize, Vec3)> {
+        let mut open = vec![false; view.width * view.height];
+        for &k in areas.iter().flat_map(|(area, _)| &area.pixels) {
+            open[k] = [0.0, INFERRED].contains(&surface.confidence[view.first + k]) && !void[view.first + k];
         }
-        for (k, mut planes) in seen {
-            let filled = surface.confidence[view.first + k] == INFERRED;
-            if filled {
-                planes.insert(view.view, surface.planes[view.first + k]);
+        let others: Vec<usize> = (0..views.len()).filter(|other| *other != view.view).collect();
+        let seen: Vec<Vec<Option<Vec3>>> =
+            others.par_iter().map(|other| view.planes_from(poses, surface, *other, &open)).collect();
+        let at = |k| {
+            let of_others = others.iter().zip(&seen).filter_map(|(other, seen)| Some((*other, seen[k]?)));
+            let mut planes: Vec<(usize, Vec3)> = of_others.collect();
+            if planes.is_empty() {
+                return None;
             }
+            let index = view.first + k;
+            let own = (surface.confidence[index] == INFERRED).then_some(surface.planes[index]);
+            let place = planes.partition_point(|(other, _)| *other < view.view);
+            own.iter().for_each(|plane| planes.insert(place, (view.view, *plane)));
+            let plane = view.most_agreed(k, &planes, own)?;
             let ray = ray(level, view.view, k % view.width, k / view.width);
-            let inverse = |p: &Vec3| p.dot(ray);
-            let is_close = |a: &Vec3, b: &Vec3| {
-                (inverse(a) - inverse(b)).abs() < WIDTH * level.tolerance[view.view] * inverse(a)
-            };
-            let agreement = |a: &Vec3| planes.values().filter(|b| is_close(a, b)).count();
-            let best = planes
-                .values()
-                .max_by(|a, b| agreement(a).cmp(&agreement(b)).then(inverse(a).total_cmp(&inverse(b))));
-            let best = best.filter(|p| !filled || agreement(p) > agreement(&surface.planes[view.first + k]));
-            if let Some(plane) = best.filter(|p| {
-                inverse(p) > 0.0 && !view.point_in_free_space(poses, surface, k, ray / inverse(p))
-            }) {
-                out.planes[view.first + k] = *plane;
-                out.confidence[view.first + k] = INFERRED;
-            }
-        }
+            let inverse = plane.dot(ray);
+            let sound = inverse > 0.0 && !view.point_in_free_space(poses, surface, k, ray / inverse);
+            sound.then_some((view.first + k, plane))
+        };
+        (0..open.len()).into_par_iter().with_min_len(1024).filter_map(at).collect()
+    };
+    let found: Vec<(usize, Vec3)> = views.par_iter().zip(areas).flat_map(of_view).collect();
+    let mut out = surface.clone();
+    for (k, plane) in found {
+        out.planes[k] = plane;
+        out.confidence[k] = INFERRED;
     }
     out
 }
@@ -164,20 +141,29 @@ fn without_contradicted(level: &Level, poses: &RelativePoses, surface: &Surface)
     })
 }
 
-/// One view with its segmentation.
-struct View<'a> {
-    level: &'a Level,
-    view: usize,
-    width: usize,
-    height: usize,
-    first: usize,
-    labels: Vec<i32>,
-    /// (label, pixels) of the areas that are large enough and of weak texture.
-    areas: Vec<(i32, Vec<usize>)>,
+/// Areas of even colour of all views; they depend on the photos alone.
+pub fn segment(level: &Level, weak: &[bool]) -> Vec<Segmentation> {
+    (0..level.references.len()).into_par_iter().map(|view| Segmentation::new(level, view, weak)).collect()
 }
 
-impl<'a> View<'a> {
-    fn new(level: &'a Level, view: usize, weak: &[bool]) -> View<'a> {
+/// Areas of one view.
+pub struct Segmentation {
+    /// Area of every pixel, as [`Area::label`].
+    labels: Vec<i32>,
+    /// Areas that are large enough and of weak texture.
+    areas: Vec<Area>,
+}
+
+/// An area of even colour.
+struct Area {
+    label: i32,
+    pixels: Vec<usize>,
+    /// The pixels, then those of the ring around them.
+    around: Vec<usize>,
+}
+
+impl Segmentation {
+    fn new(level: &Level, view: usize, weak: &[bool]) -> Segmentation {
         let r = &level.references[view];
         let (labels, count) = colour_segments(&level.guide[view]);
         let mut areas: Vec<(i32, Vec<usize>)> = (0..count as i32).map(|label| (label, Vec::new())).collect();
@@ -190,61 +176,126 @@ impl<'a> View<'a> {
             area.len() as f32 >= SMALLEST * labels.len() as f32
                 && weak_pixels as f32 > WEAK_SHARE * area.len() as f32
         });
-        View { level, view, width, height, first, labels, areas }
+        let ring = ((RING_SHARE * width as f32) as usize).max(CELL);
+        let with_ring = |(label, pixels): (i32, Vec<usize>)| {
+            let around = dilated(&pixels, ring, width, height);
+            Area { label, pixels, around }
+        };
+        Segmentation { labels, areas: areas.into_par_iter().map(with_ring).collect() }
+    }
+}
+
+/// One view with its segmentation.
+struct View<'a> {
+    level: &'a Level,
+    view: usize,
+    width: usize,
+    height: usize,
+    first: usize,
+    segments: &'a Segmentation,
+}
+
+impl<'a> View<'a> {
+    fn new(level: &'a Level, view: usize, segments: &'a Segmentation) -> View<'a> {
+        let r = &level.references[view];
+        let (width, height, first) = (r.width as usize, r.height as usize, r.first as usize);
+        View { level, view, width, height, first, segments }
     }
 
     /// Areas that are largely unmatched in `surface`, with cells of the matched pixels.
-    fn unmatched_areas<'s>(
-        &'s self,
-        surface: &'s Surface,
-    ) -> impl Iterator<Item = (&'s (i32, Vec<usize>), CellSet)> + 's {
+    fn unmatched_areas(&self, surface: &Surface) -> Vec<(&'a Area, CellSet)> {
         let depth = super::surface::depth(self.level, self.view, surface);
-        let ring = ((RING_SHARE * self.width as f32) as usize).max(CELL);
-        self.areas.iter().filter_map(move |area| {
-            let (label, pixels) = area;
+        let segments = self.segments;
+        let unmatched = |area: &'a Area| {
+            let Area { label, pixels, around } = area;
             let known = pixels.iter().filter(|&&k| depth.data[k] > 0.0).count();
             if known as f32 > MATCHED_SHARE * pixels.len() as f32 {
                 return None;
             }
-            let around = dilated(pixels, ring, self.width, self.height);
-            let inner = |k: usize| self.labels[k] == *label;
-            let cells = cells(&around, &depth.data, &inner, self.width);
+            let inner = |k: usize| segments.labels[k] == *label;
+            let cells = cells(around, &depth.data, &inner, self.width);
             let tolerance = WIDTH * self.level.tolerance[self.view];
             Some((area, CellSet { cells, tolerance, extent: extent(pixels, self.width) }))
-        })
+        };
+        segments.areas.par_iter().filter_map(unmatched).collect()
+    }
+
+    /// The nearest inferred plane of another view at each of the view's `open` pixels that shows
+    /// its colour.
+    fn planes_from(
+        &self,
+        poses: &RelativePoses,
+        surface: &Surface,
+        other: usize,
+        open: &[bool],
+    ) -> Vec<Option<Vec3>> {
+        let (level, r) = (self.level, &self.level.references[other]);
+        let mut seen: Vec<Option<Vec3>> = vec![None; open.len()];
+        for p in 0..(r.width * r.height) as usize {
+            let index = r.first as usize + p;
+            if surface.confidence[index] != INFERRED {
+                continue;
+            }
+            let ray_there = ray(level, other, p % r.width as usize, p / r.width as usize);
+            let point = ray_there / surface.planes[index].dot(ray_there);
+            let Some((u, v, _)) = poses.project(level, other, self.view, point) else { continue };
+            let k = v as usize * self.width + u as usize;
+            let (here, there) = (level.guide[self.view].data[k], level.guide[other].data[p]);
+            let colour_distance = (0..3).map(|c| (here[c] - there[c]).powi(2)).sum::<f32>().sqrt();
+            if open[k] && colour_distance < COLOUR_TOLERANCE {
+                let plane = poses.plane(other, self.view, surface.planes[index]);
+                let ray = ray(level, self.view, k % self.width, k / self.width);
+                let nearest = seen[k].get_or_insert(plane);
+                if plane.dot(ray) > nearest.dot(ray) {
+                    *nearest = plane;
+                }
+            }
+        }
+        seen
+    }
+
+    /// The plane with which most of `planes`, by view, agree at a pixel, of several the nearest;
+    /// `None` where no more agree with it than with the pixel's `own`.
+    fn most_agreed(&self, k: usize, planes: &[(usize, Vec3)], own: Option<Vec3>) -> Option<Vec3> {
+        let ray = ray(self.level, self.view, k % self.width, k / self.width);
+        let inverse = |p: &Vec3| p.dot(ray);
+        let tolerance = WIDTH * self.level.tolerance[self.view];
+        let is_close = |a: &Vec3, b: &Vec3| (inverse(a) - inverse(b)).abs() < tolerance * inverse(a);
+        let all = || planes.iter().map(|(_, plane)| plane);
+        let agreement = |a: &Vec3| all().filter(|b| is_close(a, b)).count();
+        let best =
+            all().max_by(|a, b| agreement(a).cmp(&agreement(b)).then(inverse(a).total_cmp(&inverse(b))))?;
+        own.is_none_or(|own| agreement(best) > agreement(&own)).then_some(*best)
     }
 
     /// Matched pixels of an area that lie behind its plane: mirror images.
     fn mirror_pixels(&self, surface: &Surface, seed: u32) -> Vec<usize> {
         let depth = super::surface::depth(self.level, self.view, surface);
-        let mut out = Vec::new();
-        for ((label, area), cells) in self.unmatched_areas(surface) {
-            let (planes, _) = cells.planes(hash(seed ^ *label as u32), &|_, _| false);
-            let behind: Vec<usize> = area
-                .iter()
-                .copied()
-                .filter(|&k| depth.data[k] > 0.0)
-                .filter(|&k| {
-                    let (x, y) = ((k % self.width) as f32, (k / self.width) as f32);
-                    let plane = plane_at(&planes, &[], x, y);
-                    plane
-                        .is_some_and(|p| evaluate(p, x, y) * depth.data[k] > 1.0 + MIRRORED * cells.tolerance)
-                })
-                .collect();
+        let of_area = |(area, cells): (&Area, CellSet)| -> Vec<usize> {
+            let (planes, _) = cells.planes(hash(seed ^ area.label as u32), &|_, _| false);
+            let is_behind = |k: &usize| {
+                let (x, y) = ((k % self.width) as f32, (k / self.width) as f32);
+                depth.data[*k] > 0.0
+                    && plane_at(&planes, &[], x, y).is_some_and(|p| {
+                        evaluate(p, x, y) * depth.data[*k] > 1.0 + MIRRORED * cells.tolerance
+                    })
+            };
+            let behind: Vec<usize> = area.pixels.par_iter().copied().filter(is_behind).collect();
             let inliers: usize = planes.iter().map(|p| p.inliers.len()).sum();
-            if (behind.len() as f32) < MIRROR_SHARE * (inliers * CELL * CELL) as f32 {
-                out.extend(behind.into_iter().map(|k| self.first + k));
+            match (behind.len() as f32) < MIRROR_SHARE * (inliers * CELL * CELL) as f32 {
+                true => behind.into_iter().map(|k| self.first + k).collect(),
+                false => Vec::new(),
             }
-        }
-        out
+        };
+        self.unmatched_areas(surface).into_par_iter().flat_map(of_area).collect()
     }
 
-    /// Pixels without depth in `surface`, with planes from `matched` that lie outside its free
-    /// space.
+    /// Pixels of `areas` without depth in `surface`, with planes of their cells that lie outside
+    /// its free space.
     fn inferred(
         &self,
         poses: &RelativePoses,
-        matched: &Surface,
+        areas: &[(&Area, CellSet)],
         surface: &Surface,
         void: &[bool],
         seed: u32,
@@ -252,12 +303,11 @@ impl<'a> View<'a> {
         let r = &self.level.references[self.view];
         let [far, near] = r.range;
         let in_free_space = |k: usize, plane: Affine| self.plane_in_free_space(poses, surface, k, plane);
-        let mut out = Vec::new();
-        for ((label, area), cells) in self.unmatched_areas(matched) {
+        let of_area = |(area, cells): &(&Area, CellSet)| -> Vec<(usize, Vec3)> {
             let is_open = |k: &usize| surface.confidence[self.first + k] <= 0.0 && !void[self.first + k];
-            let open: Vec<usize> = area.iter().copied().filter(is_open).collect();
+            let open: Vec<usize> = area.pixels.iter().copied().filter(is_open).collect();
             if open.is_empty() {
-                continue;
+                return Vec::new();
             }
             let pixel = |k: usize| ((k % self.width) as f32, (k / self.width) as f32);
             let violates_free_space = |plane: Affine, spread: &Spread| {
@@ -267,17 +317,18 @@ impl<'a> View<'a> {
                 let through = tested.iter().filter(|k| in_free_space(***k, plane)).count();
                 through as f32 > SEEN_THROUGH * tested.len() as f32
             };
-            let (planes, outliers) = cells.planes(hash(seed ^ *label as u32), &violates_free_space);
-            for &k in open.iter().filter(|_| !planes.is_empty()) {
+            let (planes, outliers) = cells.planes(hash(seed ^ area.label as u32), &violates_free_space);
+            let at = |&k: &usize| {
                 let (x, y) = pixel(k);
-                let Some(plane) = plane_at(&planes, &outliers, x, y) else { continue };
+                let plane = plane_at(&planes, &outliers, x, y)?;
                 // More than a factor of two beyond the searched range: a useless extrapolation.
-                if (0.5 * far..2.0 * near).contains(&evaluate(plane, x, y)) && !in_free_space(k, plane) {
-                    out.push((self.first + k, camera_plane(plane, r.intrinsics)));
-                }
-            }
-        }
-        out
+                let sound =
+                    (0.5 * far..2.0 * near).contains(&evaluate(plane, x, y)) && !in_free_space(k, plane);
+                sound.then(|| (self.first + k, camera_plane(plane, r.intrinsics)))
+            };
+            open.par_iter().filter_map(at).collect()
+        };
+        areas.par_iter().flat_map(of_area).collect()
     }
 
     /// True if at a pixel the plane lies behind the camera or in another view's free space.
@@ -325,14 +376,15 @@ fn colour_segments(guide: &RgbImage) -> (Vec<i32>, usize) {
 
 /// Pixels of an area and those up to `radius` steps away.
 fn dilated(area: &[usize], radius: usize, width: usize, height: usize) -> Vec<usize> {
-    let mut seen: HashSet<usize> = area.iter().copied().collect();
+    let mut seen = vec![false; width * height];
+    area.iter().for_each(|k| seen[*k] = true);
     let mut all = area.to_vec();
     let mut from = 0;
     for _ in 0..radius {
         let until = all.len();
         for k in from..until {
             for n in neighbours(all[k], width, height) {
-                if seen.insert(n) {
+                if !std::mem::replace(&mut seen[n], true) {
                     all.push(n);
                 }
             }

@@ -42,7 +42,7 @@ fn fill_extends_rim_without_mirror_image() {
         }
     }
     let void = vec![false; level.pixels()];
-    let filled = fill(&level, &poses, &surface, &void, &texture::weak(&level), 1);
+    let filled = fill(&level, &poses, &surface, &void, &segment(&level, &texture::weak(&level)), 1);
     let errors = map_pixels(&level, |view, x, y, k| {
         let truth = set.depth[view].at(x, y);
         let found = 1.0 / filled.planes[k].dot(ray(&level, view, x, y));
@@ -57,6 +57,6 @@ fn fill_extends_rim_without_mirror_image() {
 
     // Textured pixels are not inferred; only the mirror image loses its depth.
     let textured = vec![false; level.pixels()];
-    let untouched = fill(&level, &poses, &surface, &void, &textured, 1);
+    let untouched = fill(&level, &poses, &surface, &void, &segment(&level, &textured), 1);
     assert_eq!(untouched.confidence, surface.confidence);
 }

@@ -217,14 +217,20 @@ impl CellSet {
 /// outliers have more. If either of the two best planes is nearer at its own inliers, they form a
 /// concave corner and the nearer counts; if either is farther, a convex one.
 pub fn plane_at(planes: &[PlaneFit], outliers: &[Cell], x: f32, y: f32) -> Option<Affine> {
-    let mut reaching: Vec<(f32, &PlaneFit)> = planes
-        .iter()
-        .filter(|e| e.spread.distance(x, y) < REACH)
+    let mut within = planes.iter().filter(|e| e.spread.distance(x, y) < REACH);
+    let nearest = within.next()?;
+    let outlying = support(outliers, OUTLIER_RADIUS, x, y);
+    let others: Vec<&PlaneFit> = within.collect();
+    if others.is_empty() && outlying <= 0.0 {
+        return Some(nearest.plane);
+    }
+    let mut reaching: Vec<(f32, &PlaneFit)> = std::iter::once(nearest)
+        .chain(others)
         .map(|e| (support(&e.inliers, f32::INFINITY, x, y), e))
         .collect();
     reaching.sort_by(|a, b| b.0.total_cmp(&a.0));
     let (first_support, first) = *reaching.first()?;
-    if support(outliers, OUTLIER_RADIUS, x, y) > first_support {
+    if outlying > first_support {
         return None;
     }
     let Some(&(_, second)) = reaching.get(1) else { return Some(first.plane) };
