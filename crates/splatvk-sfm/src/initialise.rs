@@ -11,6 +11,7 @@ use crate::photo::Photo;
 use crate::progress::Progress;
 use crate::scene::{DepthPrior, GivenCamera};
 use glam::DVec2;
+use rayon::prelude::*;
 
 /// Registered photos and their cameras, the input of all later stages.
 pub struct SolvedCameras {
@@ -58,9 +59,11 @@ pub fn place(
     let mut photos = photos;
     // Fine images and overlays only serve camera estimation.
     photos.iter_mut().for_each(|p| (p.fine, p.overlay) = (None, None));
-    for ((photo, fitted), camera) in photos.iter_mut().zip(&model.fitted).zip(&model.cameras) {
-        photo.straighten(fitted.lens, camera);
-    }
+    photos
+        .par_iter_mut()
+        .zip(&model.fitted)
+        .zip(&model.cameras)
+        .for_each(|((photo, fitted), camera)| photo.straighten(fitted.lens, camera));
     let photos = light::equalised(photos, &model, progress);
     let method = if cameras.is_some() { "cameras + stereo" } else { "sfm (corners + XFeat) + stereo" };
     Ok(SolvedCameras { photos, model, left_out, method: method.into() })

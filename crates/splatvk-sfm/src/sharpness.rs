@@ -3,6 +3,7 @@ use super::sift;
 use crate::photo::Photo;
 use crate::progress::Progress;
 use crate::scene::{Image, RgbImage};
+use rayon::prelude::*;
 
 /// Long side at which sharpness is measured, pixels: near the working resolution, so that blur
 /// there shows here.
@@ -15,7 +16,7 @@ pub(super) const BLURRED: f64 = 0.6;
 /// Warns of photos that are far less sharp than the others: splats trained on them become as
 /// blurred, and their matches are less exact.
 pub(super) fn warn_of_blur(photos: &[Photo], progress: &dyn Progress) {
-    let all: Vec<f64> = photos.iter().map(|p| measure(&reduced_to(&p.image, SIDE))).collect();
+    let all: Vec<f64> = photos.par_iter().map(|p| measure(&reduced_to(&p.image, SIDE))).collect();
     for (v, photo) in photos.iter().enumerate() {
         let mut others: Vec<f64> = all.iter().enumerate().filter(|(o, _)| *o != v).map(|(_, s)| *s).collect();
         let Some(usual) = crate::math::median(&mut others) else { continue };

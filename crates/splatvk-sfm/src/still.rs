@@ -154,7 +154,7 @@ fn overlay(images: &[&RgbImage]) -> Option<Image<bool>> {
     let scale = (SIDE as f64 / w.max(h) as f64).min(1.0);
     let to = |n: usize| ((n as f64 * scale).round() as usize).max(1);
     let small: Vec<RgbImage> = images.par_iter().map(|i| i.resized_by_area(to(w), to(h))).collect();
-    let gradients: Vec<Gradients> = small.iter().map(|i| Gradients::of(&i.luma())).collect();
+    let gradients: Vec<Gradients> = small.par_iter().map(|i| Gradients::of(&i.luma())).collect();
     let least_correlation = least_correlation(&gradients)?;
     let textured = least_correlation.iter().filter(|c| c.is_some()).count();
     let least = (LEAST_AREA * least_correlation.len() as f64) as usize;

@@ -5,6 +5,7 @@ use super::numeric::minimise_small;
 use crate::math::{Random, median};
 use crate::scene::Pose;
 use glam::{DMat3, DVec2, DVec3};
+use rayon::prelude::*;
 
 /// Relative pose of two views with an estimated focal length. Pixels are centred and divided by the
 /// prior focal length of their photo; `stretch` is the estimated focal length as a multiple of the
@@ -182,11 +183,14 @@ pub(crate) fn estimate(
     } else {
         vec![1.0]
     };
-    let mut best: Option<(f64, Pose, f64)> = None;
-    for (k, m) in stretches.iter().enumerate() {
+    let of_stretch = |(k, m): (usize, &f64)| {
         let iterations = if k == 0 { 1500 } else { 300 };
-        let found = data.ransac(*m, iterations, prior_sigma, seed ^ (0x5eed_0001 + k as u64));
-        if let Some(found) = found.filter(|f| best.as_ref().is_none_or(|b| f.0 < b.0)) {
+        data.ransac(*m, iterations, prior_sigma, seed ^ (0x5eed_0001 + k as u64))
+    };
+    let all: Vec<Option<(f64, Pose, f64)>> = stretches.par_iter().enumerate().map(of_stretch).collect();
+    let mut best: Option<(f64, Pose, f64)> = None;
+    for found in all.into_iter().flatten() {
+        if best.as_ref().is_none_or(|b| found.0 < b.0) {
             best = Some(found);
         }
     }

@@ -40,9 +40,9 @@ pub(super) struct LogFocal {
 /// Estimates ln (f / long side) of photos of one camera, from those with a σ up to [`SHARP`];
 /// `None` without any. `prior` is on the same quantity; the result includes it.
 pub(super) fn log_focal<'a>(images: impl Iterator<Item = &'a RgbImage>, prior: LogFocal) -> Option<LogFocal> {
-    let sharp: Vec<LogFocal> =
-        images.filter_map(|image| Edges::of(image).log_focal(prior)).filter(|f| f.sigma <= SHARP).collect();
-    combined(&sharp)
+    let images: Vec<&RgbImage> = images.collect();
+    let sharp = |image: &&RgbImage| Edges::of(image).log_focal(prior).filter(|f| f.sigma <= SHARP);
+    combined(&images.par_iter().filter_map(sharp).collect::<Vec<_>>())
 }
 
 /// Weighted mean; σ grows where the photos differ by more than their own σ.

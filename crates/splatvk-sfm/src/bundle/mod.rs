@@ -8,10 +8,12 @@ use super::numeric::cauchy_weight;
 use crate::scene::Pose;
 use crate::{Error, Result};
 pub(crate) use displacement::DisplacementSigmas;
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
-use normal::Normal;
+use normal::{Normal, PointBlock};
+use problem::MIN_LEN;
 pub(crate) use problem::{Adjusted, INTRINSICS, Intrinsics, IntrinsicsPrior, Observation, Problem};
+use rayon::prelude::*;
 
 impl Problem {
     /// The problem after a damped Gauss–Newton step; `None` if the system is not positive definite.
@@ -38,14 +40,19 @@ impl Problem {
             intrinsics.lens.k2 += step(2).clamp(-0.1, 0.1);
             intrinsics.principal_point_offset += DVec2::new(step(3), step(4));
         }
-        for (p, inverse) in normal.points.iter().zip(&inverses) {
+        let step = |(p, inverse): (&PointBlock, &DMat3)| {
             let mut g = p.g;
             for coupling in &p.coupling {
                 for k in 0..coupling.size {
                     g -= coupling.by[k] * d[coupling.at + k];
                 }
             }
-            next.points[p.point] -= *inverse * g;
+            *inverse * g
+        };
+        let steps: Vec<DVec3> =
+            normal.points.par_iter().zip(&inverses).with_min_len(MIN_LEN).map(step).collect();
+        for (p, step) in normal.points.iter().zip(steps) {
+            next.points[p.point] -= step;
         }
         Some(next)
     }

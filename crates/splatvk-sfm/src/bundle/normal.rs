@@ -104,10 +104,12 @@ impl Problem {
     /// Normal equations of the observations of some points, without the priors.
     fn linearise_part(&self, of_points: &[&[Observation]], c: f64) -> Normal {
         let (_, n) = self.sizes();
-        let mut normal = Normal { h: DMatrix::zeros(n, n), g: DVector::zeros(n), points: Vec::new() };
+        let points = Vec::with_capacity(of_points.len());
+        let mut normal = Normal { h: DMatrix::zeros(n, n), g: DVector::zeros(n), points };
         for seen in of_points {
-            let mut block =
-                PointBlock { point: seen[0].point, v: DMat3::ZERO, g: DVec3::ZERO, coupling: Vec::new() };
+            // One coupling per view, and one per camera.
+            let coupling = Vec::with_capacity(2 * seen.len());
+            let mut block = PointBlock { point: seen[0].point, v: DMat3::ZERO, g: DVec3::ZERO, coupling };
             for Derivatives { r, w, by_point, by } in seen.iter().filter_map(|o| self.derivatives(o, c)) {
                 for (j, r) in by_point.iter().zip([r.x, r.y]) {
                     block.g += *j * (w * r);
@@ -124,8 +126,10 @@ impl Problem {
                     for (row, other) in by.iter().flatten().enumerate().skip(column) {
                         let [a, b] = other.rows;
                         for k in 0..own.size {
+                            let at = (own.at + k) * n + other.at;
+                            let out = &mut normal.h.as_mut_slice()[at..at + other.size];
                             for i in if row == column { k } else { 0 }..other.size {
-                                normal.h[(other.at + i, own.at + k)] += w * (u[k] * a[i] + v[k] * b[i]);
+                                out[i] += w * (u[k] * a[i] + v[k] * b[i]);
                             }
                         }
                     }
@@ -210,8 +214,10 @@ impl Problem {
                     let va = *inverse * column.by[k];
                     for row in &p.coupling[first..] {
                         let from = if row.at == column.at { k } else { 0 };
+                        let at = (column.at + k) * n + row.at;
+                        let out = &mut h.as_mut_slice()[at..at + row.size];
                         for i in from..row.size {
-                            h[(row.at + i, column.at + k)] += va.dot(row.by[i]);
+                            out[i] += va.dot(row.by[i]);
                         }
                     }
                 }

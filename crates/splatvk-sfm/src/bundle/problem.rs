@@ -2,6 +2,7 @@
 use crate::numeric::cauchy;
 use crate::scene::{Lens, Pose};
 use glam::{DVec2, DVec3};
+use rayon::prelude::*;
 
 /// Observation of a point in one view.
 #[derive(Clone, Copy, Debug)]
@@ -24,6 +25,9 @@ pub(crate) struct Intrinsics {
     /// Principal point relative to the image centre, original pixels.
     pub(crate) principal_point_offset: DVec2,
 }
+
+/// Fewest observations or points of a parallel task: some 50 µs.
+pub(super) const MIN_LEN: usize = 512;
 
 /// Number of parameters of [`Intrinsics`]: ln f, k1, k2, principal point offset.
 pub(crate) const INTRINSICS: usize = 5;
@@ -127,20 +131,18 @@ impl Problem {
 
     /// Robust cost; `c` is the Cauchy scale in standard deviations.
     pub(crate) fn cost(&self, c: f64) -> f64 {
-        let data: f64 = self
-            .observations
-            .iter()
-            .map(|o| {
-                let (t, p) = self.project(o);
-                // A point that a step moves behind a camera has a large, but finite cost.
-                if t.z > 1e-9 {
-                    cauchy((p - o.pixel).length_squared() / (o.sigma * o.sigma), c)
-                } else {
-                    cauchy(1e12, c)
-                }
-            })
-            .sum();
-        data + self.prior_cost()
+        let cost = |o: &Observation| {
+            let (t, p) = self.project(o);
+            // A point that a step moves behind a camera has a large, but finite cost.
+            if t.z > 1e-9 {
+                cauchy((p - o.pixel).length_squared() / (o.sigma * o.sigma), c)
+            } else {
+                cauchy(1e12, c)
+            }
+        };
+        // The order of the sum does not depend on the number of threads.
+        let costs: Vec<f64> = self.observations.par_iter().with_min_len(MIN_LEN).map(cost).collect();
+        costs.into_iter().sum::<f64>() + self.prior_cost()
     }
 
     fn prior_cost(&self) -> f64 {

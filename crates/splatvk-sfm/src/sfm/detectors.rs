@@ -76,7 +76,7 @@ fn within(f: &Keypoints, valid: &Image<bool>) -> Keypoints {
 
 /// Keypoints of all photos on valid pixels.
 pub(super) fn masked(photos: &[Photo], features: &[Keypoints]) -> Vec<Keypoints> {
-    photos.iter().zip(features).map(|(p, f)| within(f, &valid(p))).collect()
+    photos.par_iter().zip(features).map(|(p, f)| within(f, &valid(p))).collect()
 }
 
 /// Keypoints of a view over all detectors, numbered as in [`super::tracks::KeypointMatch`].

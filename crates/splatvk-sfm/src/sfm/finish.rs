@@ -56,7 +56,7 @@ pub(super) fn finish(
     }
     progress.check()?;
     let undistorted: Vec<RgbImage> =
-        (0..photos.len()).map(|v| undistorted_image(&model, v, &photos[v].image)).collect();
+        photos.par_iter().enumerate().map(|(v, p)| undistorted_image(&model, v, &p.image)).collect();
     sub_pixel(&mut model, photos, &undistorted, threshold, progress)?;
     progress.step(4, "optics");
     let mut outcome = estimate_intrinsics(&mut model)?;
@@ -87,7 +87,7 @@ pub(super) fn sub_pixel(
     let images: Vec<LumaGradients> =
         undistorted.par_iter().map(|image| LumaGradients::new(&image.luma())).collect();
     let valid: Vec<Image<bool>> = photos
-        .iter()
+        .par_iter()
         .zip(undistorted)
         .map(|(p, image)| matching::valid_area(image, p.border, p.coverage.as_ref(), MARGIN))
         .collect();

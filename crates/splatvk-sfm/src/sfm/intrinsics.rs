@@ -5,6 +5,7 @@ use super::fit::{IntrinsicsFit, MAX_COST_SHARE, STEPS, fit_intrinsics};
 use super::model::{Model, RefinedIntrinsics};
 use crate::Result;
 use crate::bundle::Adjusted;
+use rayon::prelude::*;
 
 /// Most steps from an optimum of the same observations with one camera more: the cost that remains
 /// after them does not decide.
@@ -20,7 +21,8 @@ pub(super) fn adjust_intrinsics(model: &mut Model, refined: RefinedIntrinsics) -
 
 /// Best fit over `choices`, with the standard deviations of the last of them.
 fn best_fit(model: &Model, choices: &[RefinedIntrinsics]) -> Result<IntrinsicsFit> {
-    let mut all = choices.iter().map(|f| fit_intrinsics(model, *f, STEPS)).collect::<Result<Vec<_>>>()?;
+    let fit = |refined: &RefinedIntrinsics| fit_intrinsics(model, *refined, STEPS);
+    let mut all = choices.par_iter().map(fit).collect::<Vec<_>>().into_iter().collect::<Result<Vec<_>>>()?;
     let of_all = all.last().map(|e| e.outcome.clone());
     all.sort_by(|a, b| a.bic.total_cmp(&b.bic));
     let mut best = all.swap_remove(0);
@@ -65,14 +67,20 @@ pub(super) fn estimate_intrinsics(model: &mut Model) -> Result<Adjusted> {
         && apart.as_ref().is_some_and(|a| a.camera_ids != model.camera_ids);
     let decided = model.has_crops() || merged;
     let start = if decided { model.clone() } else { model.with_camera_ids(&model.camera_ids_by_file) };
-    let mut found = best_fit(&start, &RefinedIntrinsics::ALL)?;
-    if let Some(apart) = apart.filter(|_| !decided) {
-        let apart = best_fit(&apart, &[RefinedIntrinsics::Focal, RefinedIntrinsics::Radial])?;
-        if apart.bic < found.bic {
-            let several = best_fit(&merge_cameras(apart)?.model, &RefinedIntrinsics::ALL)?;
-            if several.bic < shared_camera_criterion(&found)? {
-                found = several;
-            }
+    let (found, apart) = rayon::join(
+        || best_fit(&start, &RefinedIntrinsics::ALL),
+        || {
+            let few = [RefinedIntrinsics::Focal, RefinedIntrinsics::Radial];
+            apart.filter(|_| !decided).map(|apart| best_fit(&apart, &few))
+        },
+    );
+    let mut found = found?;
+    if let Some(apart) = apart.transpose()?
+        && apart.bic < found.bic
+    {
+        let several = best_fit(&merge_cameras(apart)?.model, &RefinedIntrinsics::ALL)?;
+        if several.bic < shared_camera_criterion(&found)? {
+            found = several;
         }
     }
     found = crops::with_crops(found)?;

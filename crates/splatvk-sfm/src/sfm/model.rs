@@ -3,6 +3,7 @@ use crate::Result;
 use crate::bundle::{Adjusted, DisplacementSigmas, Intrinsics, IntrinsicsPrior, Observation, Problem};
 use crate::scene::{Lens, Pose};
 use glam::{DMat3, DVec2, DVec3};
+use rayon::prelude::*;
 
 /// Largest effective number of independent observations of a photo set. Neighbouring observations
 /// have correlated errors (a bent surface taken for flat, JPEG, a moved shadow), so that thousands
@@ -330,14 +331,11 @@ impl Model {
     /// pair with the largest support. Observations are kept; tracks that do not triangulate have no
     /// position.
     pub(super) fn triangulate_all(&mut self, threshold: f64) {
-        let positions: Vec<Option<DVec3>> = self
-            .tracks
-            .iter()
-            .map(|t| {
-                let all = self.triangulate(&t.elements, threshold);
-                all.or_else(|| self.triangulate_best_pair(&t.elements, threshold))
-            })
-            .collect();
+        let position = |t: &Track| {
+            let all = self.triangulate(&t.elements, threshold);
+            all.or_else(|| self.triangulate_best_pair(&t.elements, threshold))
+        };
+        let positions: Vec<Option<DVec3>> = self.tracks.par_iter().map(position).collect();
         for (t, p) in self.tracks.iter_mut().zip(positions) {
             t.position = p;
         }

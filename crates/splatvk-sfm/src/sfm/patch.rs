@@ -7,6 +7,8 @@ use nalgebra::{DMatrix, DVector};
 
 /// Half the side of a patch: 13 × 13 pixels hold enough texture at corners and stay planar.
 pub(super) const RADIUS: i32 = 6;
+/// Pixels of a patch.
+const PIXELS: usize = ((2 * RADIUS + 1) * (2 * RADIUS + 1)) as usize;
 /// σ of the Gaussian window, pixels: the point itself matters most.
 const WINDOW: f64 = 4.0;
 /// σ of the blur before sampling, pixels: hides the pixel grid from the bilinear interpolation.
@@ -106,11 +108,11 @@ fn window() -> Vec<(DVec2, f64)> {
 }
 
 /// Zero-mean, unit-variance values under the window, and their σ; `None` without texture.
-fn standardised(values: &[f64], offsets: &[(DVec2, f64)]) -> Option<(Vec<f64>, f64)> {
+fn standardised(values: &[f64; PIXELS], offsets: &[(DVec2, f64)]) -> Option<([f64; PIXELS], f64)> {
     let mean: f64 = values.iter().zip(offsets).map(|(v, o)| v * o.1).sum();
     let variance: f64 = values.iter().zip(offsets).map(|(v, o)| (v - mean).powi(2) * o.1).sum();
     let sigma = variance.sqrt();
-    (sigma > MIN_CONTRAST).then(|| (values.iter().map(|v| (v - mean) / sigma).collect(), sigma))
+    (sigma > MIN_CONTRAST).then(|| (values.map(|v| (v - mean) / sigma), sigma))
 }
 
 /// Maps a patch of the reference view into another view through a plane of inverse depth `a (1 +
@@ -167,6 +169,24 @@ pub(super) struct Aligner<'a> {
     pub(super) model: &'a Model,
     pub(super) images: &'a [LumaGradients],
     offsets: Vec<(DVec2, f64)>,
+    /// From view `i / views` to view `i % views`.
+    warps: Vec<Option<Warp>>,
+}
+
+/// Patch of a facet in its own view.
+pub(super) struct Template {
+    /// Standardised values.
+    values: [f64; PIXELS],
+    /// Viewing rays of the pixels.
+    rays: [DVec3; PIXELS],
+}
+
+/// A patch warped into another view.
+struct Warped {
+    values: [f64; PIXELS],
+    gradients: [DVec2; PIXELS],
+    /// Derivatives of the positions by the two slants.
+    moves: [[DVec2; 2]; PIXELS],
 }
 
 /// A patch of the reference view: centre and local plane.
@@ -182,58 +202,60 @@ pub(super) struct Facet {
 
 impl<'a> Aligner<'a> {
     pub(super) fn new(model: &'a Model, images: &'a [LumaGradients]) -> Aligner<'a> {
-        Aligner { model, images, offsets: window() }
+        let views = model.poses.len();
+        let warps = (0..views * views).map(|i| Warp::new(model, i / views, i % views)).collect();
+        Aligner { model, images, offsets: window(), warps }
+    }
+
+    /// Warp between two views; `None` where one is not registered.
+    fn warp(&self, reference: usize, other: usize) -> Option<&Warp> {
+        self.warps[reference * self.model.poses.len() + other].as_ref()
     }
 
     /// Standardised patch of the facet in its own view; `None` at the image edge or without
     /// texture.
-    pub(super) fn template(&self, f: &Facet) -> Option<Vec<f64>> {
-        let values: Option<Vec<f64>> =
-            self.offsets.iter().map(|o| self.images[f.view].value_at(f.pixel + o.0)).collect();
-        Some(standardised(&values?, &self.offsets)?.0)
+    pub(super) fn template(&self, f: &Facet) -> Option<Template> {
+        let mut values = [0.0; PIXELS];
+        for (value, (d, _)) in values.iter_mut().zip(&self.offsets) {
+            *value = self.images[f.view].value_at(f.pixel + *d)?;
+        }
+        let (values, _) = standardised(&values, &self.offsets)?;
+        let rays = std::array::from_fn(|i| self.model.ray(f.view, f.pixel + self.offsets[i].0));
+        Some(Template { values, rays })
     }
 
-    /// Normalised cross-correlation of a facet's template with another view, shifted by `shift`.
-    pub(super) fn ncc(&self, template: &[f64], f: &Facet, other: usize, shift: DVec2) -> Option<f64> {
-        let warp = Warp::new(self.model, f.view, other)?;
-        let values: Option<Vec<f64>> = self
-            .offsets
-            .iter()
-            .map(|(d, _)| {
-                let p = warp.position(self.model.ray(f.view, f.pixel + *d), f.inverse_depth, f.slant, *d)?;
-                self.images[other].value_at(p + shift)
-            })
-            .collect();
-        let (sampled, _) = standardised(&values?, &self.offsets)?;
-        Some(sampled.iter().zip(template).zip(&self.offsets).map(|((a, b), o)| a * b * o.1).sum())
+    /// Normalised cross-correlation of a facet with another view, shifted by `shift`; `template` is
+    /// the patch at the facet's pixel.
+    pub(super) fn ncc(&self, template: &Template, f: &Facet, other: usize, shift: DVec2) -> Option<f64> {
+        let warp = self.warp(f.view, other)?;
+        let mut values = [0.0; PIXELS];
+        for ((value, ray), (d, _)) in values.iter_mut().zip(&template.rays).zip(&self.offsets) {
+            let p = warp.position(*ray, f.inverse_depth, f.slant, *d)?;
+            *value = self.images[other].value_at(p + shift)?;
+        }
+        let (sampled, _) = standardised(&values, &self.offsets)?;
+        Some(sampled.iter().zip(&template.values).zip(&self.offsets).map(|((a, b), o)| a * b * o.1).sum())
     }
 
     /// Values, gradients and slant derivatives of the warped patch.
-    #[expect(clippy::type_complexity, reason = "three parallel arrays used once")]
-    fn sample_warped(
-        &self,
-        f: &Facet,
-        other: usize,
-        shift: DVec2,
-    ) -> Option<(Vec<f64>, Vec<DVec2>, Vec<[DVec2; 2]>)> {
-        let warp = Warp::new(self.model, f.view, other)?;
-        let n = self.offsets.len();
-        let (mut values, mut gradients, mut moves) =
-            (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
-        for (d, _) in &self.offsets {
-            let ray = self.model.ray(f.view, f.pixel + *d);
-            let (p, by) = warp.apply(ray, f.inverse_depth, f.slant, *d)?;
-            let (value, gradient) = self.images[other].sample(p + shift)?;
-            values.push(value);
-            gradients.push(gradient);
-            moves.push(by);
+    fn sample_warped(&self, template: &Template, f: &Facet, other: usize, shift: DVec2) -> Option<Warped> {
+        let warp = self.warp(f.view, other)?;
+        let mut out = Warped {
+            values: [0.0; PIXELS],
+            gradients: [DVec2::ZERO; PIXELS],
+            moves: [[DVec2::ZERO; 2]; PIXELS],
+        };
+        for (i, (ray, (d, _))) in template.rays.iter().zip(&self.offsets).enumerate() {
+            let (p, by) = warp.apply(*ray, f.inverse_depth, f.slant, *d)?;
+            (out.values[i], out.gradients[i]) = self.images[other].sample(p + shift)?;
+            out.moves[i] = by;
         }
-        Some((values, gradients, moves))
+        Some(out)
     }
 
     /// Projection of the facet's centre without shift.
     pub(super) fn project_centre(&self, f: &Facet, other: usize) -> Option<DVec2> {
-        let warp = Warp::new(self.model, f.view, other)?;
+        let warp = self.warp(f.view, other)?;
         let ray = self.model.ray(f.view, f.pixel);
         warp.apply(ray, f.inverse_depth, f.slant, DVec2::ZERO).map(|w| w.0)
     }
@@ -256,18 +278,17 @@ impl<'a> Aligner<'a> {
             let (mut h, mut g) = (DMatrix::<f64>::zeros(n, n), DVector::<f64>::zeros(n));
             scores.clear();
             for (k, (view, shift)) in active.iter().enumerate() {
-                let step = self.sample_warped(&f, *view, *shift).and_then(|(values, gradients, moves)| {
-                    let (sampled, sigma) = standardised(&values, &self.offsets)?;
-                    Some((sampled, sigma, gradients, moves))
+                let step = self.sample_warped(&template, &f, *view, *shift).and_then(|warped| {
+                    let (sampled, sigma) = standardised(&warped.values, &self.offsets)?;
+                    Some((Warped { values: sampled, ..warped }, sigma))
                 });
-                let Some((sampled, sigma, gradients, moves)) = step else {
+                let Some((warped, sigma)) = step else {
                     scores.push(-1.0);
                     h[(2 + 2 * k, 2 + 2 * k)] += 1.0;
                     h[(3 + 2 * k, 3 + 2 * k)] += 1.0;
                     continue;
                 };
-                scores
-                    .push(self.accumulate(&template, &sampled, sigma, &gradients, &moves, k, &mut h, &mut g));
+                scores.push(self.accumulate(&template, &warped, sigma, k, &mut h, &mut g));
             }
             // Slant prior against the starting plane, in units of the patch residual (about 0.3 at
             // NCC 0.95).
@@ -313,27 +334,25 @@ impl<'a> Aligner<'a> {
         (!aligned.is_empty()).then_some((f, aligned))
     }
 
-    /// Adds one view to the normal equations; returns its correlation.
+    /// Adds one view, whose values are standardised, to the normal equations; returns its
+    /// correlation.
     fn accumulate(
         &self,
-        template: &[f64],
-        sampled: &[f64],
+        template: &Template,
+        warped: &Warped,
         sigma: f64,
-        gradients: &[DVec2],
-        moves: &[[DVec2; 2]],
         k: usize,
         h: &mut DMatrix<f64>,
         g: &mut DVector<f64>,
     ) -> f64 {
-        let rows: Vec<[f64; 4]> = gradients
-            .iter()
-            .zip(moves)
-            .map(|(q, m)| [q.dot(m[0]), q.dot(m[1]), q.x, q.y].map(|v| v / sigma))
-            .collect();
+        let rows: [[f64; 4]; PIXELS] = std::array::from_fn(|i| {
+            let (q, m) = (warped.gradients[i], warped.moves[i]);
+            [q.dot(m[0]), q.dot(m[1]), q.x, q.y].map(|v| v / sigma)
+        });
         // Standardising removes the mean and the component along the patch itself from every
         // derivative.
         let (mut mean, mut along) = ([0.0; 4], [0.0; 4]);
-        for ((row, s), o) in rows.iter().zip(sampled).zip(&self.offsets) {
+        for ((row, s), o) in rows.iter().zip(&warped.values).zip(&self.offsets) {
             for c in 0..4 {
                 mean[c] += o.1 * row[c];
                 along[c] += o.1 * row[c] * s;
@@ -341,14 +360,24 @@ impl<'a> Aligner<'a> {
         }
         let index = [0, 1, 2 + 2 * k, 3 + 2 * k];
         let mut correlation = 0.0;
-        for (((row, s), t), o) in rows.iter().zip(sampled).zip(template).zip(&self.offsets) {
+        // The view's entries in registers.
+        let mut own_g = index.map(|a| g[a]);
+        let mut own_h = index.map(|a| index.map(|b| h[(a, b)]));
+        for (((row, s), t), o) in rows.iter().zip(&warped.values).zip(&template.values).zip(&self.offsets) {
             let j: [f64; 4] = std::array::from_fn(|c| row[c] - mean[c] - along[c] * s);
             correlation += o.1 * s * t;
             for a in 0..4 {
-                g[index[a]] += o.1 * j[a] * (s - t);
+                let weighted = o.1 * j[a];
+                own_g[a] += weighted * (s - t);
                 for b in 0..4 {
-                    h[(index[a], index[b])] += o.1 * j[a] * j[b];
+                    own_h[a][b] += weighted * j[b];
                 }
+            }
+        }
+        for a in 0..4 {
+            g[index[a]] = own_g[a];
+            for b in 0..4 {
+                h[(index[a], index[b])] = own_h[a][b];
             }
         }
         correlation
@@ -365,7 +394,7 @@ impl<'a> Aligner<'a> {
 
     /// The facet's plane in another view, centred at `pixel`.
     fn transfer(&self, f: &Facet, other: usize, pixel: DVec2) -> Option<Facet> {
-        let warp = Warp::new(self.model, f.view, other)?;
+        let warp = self.warp(f.view, other)?;
         // Inverse depth in the other view at three points of the patch.
         let project = |d: DVec2| -> Option<(DVec2, f64)> {
             let ray = self.model.ray(f.view, f.pixel + d);

@@ -90,8 +90,9 @@ fn most_central(model: &Model, track: &Track, x: DVec3) -> usize {
 /// estimated separately. `reach`: distance up to which neighbours predict the local plane of a
 /// point, pixels.
 pub(super) fn refine(model: &mut Model, images: &[LumaGradients], detector: usize, reach: f64) {
-    let points: Vec<ViewPoints> = (0..model.poses.len()).map(|v| ViewPoints::new(model, v)).collect();
     let fixed = &*model;
+    let points: Vec<ViewPoints> =
+        (0..fixed.poses.len()).into_par_iter().map(|v| ViewPoints::new(fixed, v)).collect();
     let aligner = Aligner::new(fixed, images);
     let moved: Vec<Option<Vec<TrackElement>>> =
         fixed.tracks.par_iter().map(|t| refine_track(&aligner, &points, t, detector, reach)).collect();
@@ -159,14 +160,12 @@ const MIN_GUIDED_NCC: f64 = 0.88;
 pub(super) fn extend(model: &mut Model, images: &[LumaGradients], valid: &[Image<bool>]) -> usize {
     let fixed = &*model;
     let aligner = Aligner::new(fixed, images);
-    let mut all: Vec<Track> = Vec::new();
-    for view in 0..fixed.poses.len() {
+    let of_view = |view: usize| -> Vec<Track> {
         let points = ViewPoints::new(fixed, view);
         let corners = free_corners(&images[view], &valid[view], &points);
-        let found: Vec<Option<Track>> =
-            corners.par_iter().map(|p| predict_track(&aligner, &points, valid, view, *p)).collect();
-        all.extend(found.into_iter().flatten());
-    }
+        corners.par_iter().filter_map(|p| predict_track(&aligner, &points, valid, view, *p)).collect()
+    };
+    let all: Vec<Track> = (0..fixed.poses.len()).into_par_iter().flat_map(of_view).collect();
     let count = all.len();
     model.tracks.extend(all);
     count

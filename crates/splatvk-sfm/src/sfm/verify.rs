@@ -233,18 +233,15 @@ fn verify(photos: &[Photo], pair: &Matches, empty: &Model) -> TwoViewGeometry {
     let threshold = THRESHOLD * long / empty.focal(i);
     let sigma = |v: usize| empty.priors[empty.camera_ids[v]].log_focal.1;
     let sigma = sigma(i).max(sigma(j));
-    let rotation_zoom = homography::estimate(&x, &y, threshold, empty.seed).map(|h| {
+    let rotation_zoom = || {
+        let h = homography::estimate(&x, &y, threshold, empty.seed)?;
         let known = |v: usize| photos[v].exif_focal.is_some();
         let zoom = if known(i) && known(j) { SAME_ZOOM } else { LARGEST_ZOOM };
-        homography::fit_rotation_zoom(
-            &h,
-            &x,
-            &y,
-            threshold,
-            FocalRange { each: 2.0 * sigma, zoom: zoom.ln() },
-        )
-    });
-    let found = two_view::estimate(&x, &y, threshold, sigma, empty.seed);
+        let range = FocalRange { each: 2.0 * sigma, zoom: zoom.ln() };
+        Some(homography::fit_rotation_zoom(&h, &x, &y, threshold, range))
+    };
+    let (rotation_zoom, found) =
+        rayon::join(rotation_zoom, || two_view::estimate(&x, &y, threshold, sigma, empty.seed));
     let Some(found) = found.filter(|f| f.inliers.len() >= MIN_INLIERS) else {
         // A rotation so large that no translation explains the matches as well.
         let agree = rotation_zoom.map_or(0.0, |t| t.share(&x, &y, threshold) * x.len() as f64);
