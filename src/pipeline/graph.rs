@@ -11,6 +11,7 @@ use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::marker::PhantomData;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::thread::Scope;
 use std::time::Instant;
 
 type Work<'g> = Box<dyn FnOnce(&[Value], &Context) -> Result<Value> + Send + 'g>;
@@ -121,20 +122,26 @@ impl<'g> Graph<'g> {
         let shared = Shared { graph: self, keys, store, state: Mutex::new(state), changed: Condvar::new() };
         let processor_progress = progress.second_lane();
         let context = Context { device, registry, progress };
+        let shared = &shared;
         let (device_lane, processor_lane) = std::thread::scope(|scope| {
-            let other = scope.spawn(|| {
-                let context = Context { device, registry, progress: processor_progress.as_ref() };
-                shared.work(Lane::Processor, &context, progress)
+            let processor_progress = processor_progress.as_ref();
+            let other = scope.spawn(move || {
+                let context = Context { device, registry, progress: processor_progress };
+                shared.work(scope, Lane::Processor, &context, progress)
             });
-            let device_lane = shared.work(Lane::Device, &context, progress);
+            let device_lane = shared.work(scope, Lane::Device, &context, progress);
             // A panic of the other thread continues in this one.
             (device_lane, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
         });
-        let state = shared.state.into_inner().unwrap_or_else(PoisonError::into_inner);
-        if let Err(error) = both(device_lane, processor_lane) {
+        let mut state = shared.lock();
+        let state = &mut *state;
+        let unsaved = state.unsaved.take().map_or(Ok(()), Err);
+        if let Err(error) = both(device_lane, processor_lane).and(unsaved) {
             let checkpoint_of =
                 |n: usize| store.checkpoint(self.nodes[n].name, &shared.keys[n])?.named(self.nodes[n].name);
             let begun = (0..self.nodes.len()).rev().find_map(checkpoint_of);
+            let place = |name: &&str| self.nodes.iter().position(|n| n.name == *name);
+            state.kept.sort_by_key(place);
             if !state.kept.is_empty() {
                 let names = state.kept.join(", ");
                 progress.inform(&format!("kept: {names}; the same command with --resume goes on from there"));
@@ -142,7 +149,8 @@ impl<'g> Graph<'g> {
             return Err(error.keeping(begun.or(state.kept.last().map(|stage| format!("stage {stage}")))));
         }
         let needs = self.nodes.iter().map(|n| n.needs.clone()).collect();
-        Ok(Outputs { values: state.values, seconds: state.seconds, needs })
+        let (values, seconds) = (std::mem::take(&mut state.values), std::mem::take(&mut state.seconds));
+        Ok(Outputs { values, seconds, needs })
     }
 
     /// Keys of all stages.
@@ -170,6 +178,7 @@ impl<'g> Graph<'g> {
             warnings: vec![Vec::new(); n],
             users: vec![0; n],
             kept: Vec::new(),
+            unsaved: None,
             failed: false,
         };
         let mut pending: BTreeSet<usize> = targets.iter().copied().collect();
@@ -205,7 +214,7 @@ impl<'g> Graph<'g> {
 }
 
 /// Checksum of the running program: the outputs of another build may differ.
-fn program() -> &'static str {
+pub(crate) fn program() -> &'static str {
     static PROGRAM: OnceLock<String> = OnceLock::new();
     PROGRAM.get_or_init(|| {
         let bytes = std::env::current_exe().and_then(std::fs::read);
@@ -226,6 +235,8 @@ struct State {
     users: Vec<usize>,
     /// Stages whose output is on disk now.
     kept: Vec<&'static str>,
+    /// First output that has no bytes to keep: an error of its codec.
+    unsaved: Option<Error>,
     failed: bool,
 }
 
@@ -242,8 +253,15 @@ impl Shared<'_, '_> {
         lock(&self.state)
     }
 
-    /// Runs the stages of a lane until none is left or a stage of any lane has failed.
-    fn work(&self, lane: Lane, context: &Context, progress: &Recorded) -> Result<()> {
+    /// Runs the stages of a lane until none is left or a stage of any lane has failed. Outputs are
+    /// written to the store in `scope`, while the next stages run.
+    fn work<'scope, 'env: 'scope>(
+        &'env self,
+        scope: &'scope Scope<'scope, 'env>,
+        lane: Lane,
+        context: &Context,
+        progress: &'env Recorded,
+    ) -> Result<()> {
         // Stops the other lane also when a stage panics.
         let guard = StopOnDrop { shared: self, progress };
         while let Some((node, inputs)) = self.next(lane) {
@@ -263,11 +281,10 @@ impl Shared<'_, '_> {
             warnings.splice(0..0, stage.needs.iter().flat_map(|n| self.lock().warnings[*n].clone()));
             let seconds = began.elapsed().as_secs_f64();
             self.store.memory_put(stage.name, &self.keys[node], &value, seconds);
-            let warn = |text: &str| context.progress.warn(text);
-            let kept = (stage.save)(self.store, &self.keys[node], &warnings, &value, &warn)?;
-            recorder.checkpoint.iter().for_each(Checkpoint::remove);
+            let (kept_value, kept_warnings) = (value.clone(), warnings.clone());
+            let checkpoint = recorder.checkpoint;
+            scope.spawn(move || self.save(node, kept_value, &kept_warnings, checkpoint, progress));
             let mut state = self.lock();
-            state.kept.extend(kept.then_some(stage.name));
             (state.values[node], state.seconds[node]) = (Some(value), seconds);
             state.warnings[node] = warnings;
             for &need in &stage.needs {
@@ -281,6 +298,29 @@ impl Shared<'_, '_> {
         // The lane is done, or the other lane has failed and set the flag.
         std::mem::forget(guard);
         Ok(())
+    }
+
+    /// Writes an output to the store, after which its checkpoint is of no use.
+    fn save(
+        &self,
+        node: usize,
+        value: Value,
+        warnings: &[String],
+        checkpoint: Option<Checkpoint>,
+        progress: &Recorded,
+    ) {
+        let stage = &self.graph.nodes[node];
+        let warn = |text: &str| progress.warn(text);
+        let kept = (stage.save)(self.store, &self.keys[node], warnings, &value, &warn);
+        let mut state = self.lock();
+        match kept {
+            Ok(kept) => state.kept.extend(kept.then_some(stage.name)),
+            Err(error) => {
+                state.unsaved.get_or_insert(error);
+            }
+        }
+        drop(state);
+        checkpoint.iter().for_each(Checkpoint::remove);
     }
 
     /// Waits for the first stage of the lane with all inputs; `None` when no more will run.

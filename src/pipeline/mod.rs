@@ -8,6 +8,7 @@ mod store;
 #[cfg(test)]
 mod tests;
 
+pub(crate) use graph::program;
 pub use graph::{Graph, Outputs};
 pub use output::{Inputs, Output};
 pub use stage::{Context, Lane, Stage};
