@@ -5,6 +5,7 @@ use crate::Result;
 use crate::math::quantile;
 use crate::scene::{Camera, Splats};
 use glam::DVec3;
+use rayon::prelude::*;
 
 /// Largest standard deviation of a splat over its distance to the nearest camera. Three standard
 /// deviations are then less than half of that distance, within which the affine approximation of
@@ -58,12 +59,12 @@ impl Bounds {
 
     /// Removes splats that are too near and shortens those that are too large.
     pub(super) fn clamp_to_bounds(&self, splats: Splats) -> Splats {
-        let mut splats = splats.picked(
-            &(0..splats.len()).filter(|i| !self.too_near(position(&splats.means[*i]))).collect::<Vec<_>>(),
-        );
-        for (mean, scales) in splats.means.iter().zip(&mut splats.log_scales) {
+        let is_far = |i: &usize| !self.too_near(position(&splats.means[*i]));
+        let rows: Vec<usize> = (0..splats.len()).into_par_iter().filter(is_far).collect();
+        let mut splats = splats.picked(&rows);
+        splats.means.par_iter().zip(&mut splats.log_scales).for_each(|(mean, scales)| {
             self.shorten(mean, scales);
-        }
+        });
         splats
     }
 
@@ -72,16 +73,15 @@ impl Bounds {
     pub(super) fn clamp_model_to_bounds(&self, model: &mut Model) -> Result<bool> {
         let means = model.values.means.read()?;
         let mut scales = model.values.log_scales.read()?;
-        let splats = || means.chunks_exact(3).map(|m| [m[0], m[1], m[2]]);
-        let mut changed = false;
-        for (mean, scales) in splats().zip(scales.chunks_exact_mut(3)) {
-            changed |= self.shorten(&mean, scales);
-        }
+        let splats = || means.par_chunks_exact(3).map(|m| [m[0], m[1], m[2]]);
+        let shortened = splats().zip(scales.par_chunks_exact_mut(3));
+        let changed =
+            shortened.map(|(mean, scales)| self.shorten(&mean, scales)).reduce(|| false, |a, b| a | b);
         if changed {
             model.values.log_scales.write(&scales)?;
         }
-        let rows = splats().zip(0..).filter(|(mean, _)| !self.too_near(position(mean)));
-        model.keep(&rows.map(|(_, row)| row).collect::<Vec<u32>>())
+        let far = splats().enumerate().filter(|(_, mean)| !self.too_near(position(mean)));
+        model.keep(&far.map(|(row, _)| row as u32).collect::<Vec<u32>>())
     }
 }
 

@@ -263,13 +263,14 @@ impl<'a> Run<'a> {
                 all.len()
             )));
         }
-        for feature in all.chunks_exact_mut(d) {
+        let epsilon = self.options.epsilon;
+        all.par_chunks_exact_mut(d).for_each(|feature| {
             let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
-            feature.iter_mut().for_each(|v| *v /= norm + self.options.epsilon);
-        }
+            feature.iter_mut().for_each(|v| *v /= norm + epsilon);
+        });
         let features_of =
             |l: usize| all.chunks_exact(levels * d).flat_map(move |f| &f[l * d..(l + 1) * d]).copied();
-        Ok((splats, (0..levels).map(|l| features_of(l).collect()).collect()))
+        Ok((splats, (0..levels).into_par_iter().map(|l| features_of(l).collect()).collect()))
     }
 }
 

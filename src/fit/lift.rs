@@ -9,6 +9,7 @@ use crate::pass::options::{FeatureMode, RasterOptions};
 use crate::progress::Progress;
 use crate::scene::{Camera, LevelField, RgbImage};
 use crate::{Error, Result};
+use rayon::prelude::*;
 
 /// Least blending weight over labelled pixels, in pixels; splats with less start without a feature,
 /// whose direction would be noise (docs/internals/method.md#lifting).
@@ -170,7 +171,7 @@ impl Lifting<'_> {
             }
         }
         let seen = model.feature_gradients.read_range(0..sums.len())?;
-        sums.iter_mut().zip(seen).for_each(|(s, v)| *s += v);
+        sums.par_iter_mut().zip(seen).for_each(|(s, v)| *s += v);
         Ok(())
     }
 }
@@ -180,7 +181,7 @@ impl Lifted {
     pub(super) fn features(&self, width: usize) -> Vec<f32> {
         let mut features = self.sums.clone();
         // The length of a sum is at most the weight, and equal if all codes agree.
-        features.chunks_exact_mut(width).filter(|f| length(f) <= MIN_WEIGHT).for_each(|f| f.fill(0.0));
+        features.par_chunks_exact_mut(width).filter(|f| length(f) <= MIN_WEIGHT).for_each(|f| f.fill(0.0));
         unit_start(features, width)
     }
 
@@ -199,12 +200,12 @@ impl Lifted {
 
 /// Scales features to the length that training starts from; zeros stay.
 pub(super) fn unit_start(mut features: Vec<f32>, width: usize) -> Vec<f32> {
-    for feature in features.chunks_exact_mut(width) {
+    features.par_chunks_exact_mut(width).for_each(|feature| {
         let norm = length(feature);
         if norm > 0.0 {
             feature.iter_mut().for_each(|v| *v *= LIFTED_LENGTH / norm);
         }
-    }
+    });
     features
 }
 

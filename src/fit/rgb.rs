@@ -105,7 +105,9 @@ pub(crate) fn train_photos(
     progress: &dyn Progress,
 ) -> Result<Trained> {
     let Photos { images, cameras, depths, .. } = photos;
+    progress.begin("initial splats", 2);
     let mut start = splats_from_points(points, &options.init, options.seed)?;
+    progress.step(1, "");
     // With an empty background, surfaces end at the silhouette.
     if let Some(depths) = depths.filter(|_| options.margin > 0.0 && !photos.show_emptiness()) {
         let (reach, confidence) = (options.margin, options.min_confidence);
@@ -115,6 +117,7 @@ pub(crate) fn train_photos(
         start = Bounds::new(cameras, &points.positions).clamp_to_bounds(start);
     }
     let scale = SceneScale::of(cameras, points);
+    progress.end();
     fit_photos(device, photos, start, scale, options, progress)
 }
 

@@ -52,7 +52,7 @@ pub fn unseen_splats(
         own
     };
     let views = images.len().min(depths.len());
-    let mut all: Vec<UnseenSplat> = (0..views).into_par_iter().flat_map_iter(splats_of_view).collect();
+    let mut all: Vec<UnseenSplat> = (0..views).into_par_iter().flat_map(splats_of_view).collect();
     // Where several photos continue one surface, the nearest end has priority.
     all.sort_by(|a, b| a.distance.total_cmp(&b.distance));
     let mut taken = HashSet::new();
@@ -79,27 +79,28 @@ fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<UnseenSplat
     let continued = |anchor: &Anchor, pixel: DVec2, step: f64| {
         candidate(shown.camera, anchor, pixel, anchor.at.distance(pixel), step)
     };
-    let mut out = Vec::new();
-    for pixel in shown.cells(step, reach) {
+    let beyond = |pixel: DVec2| -> Option<[Option<UnseenSplat>; 2]> {
         let border = pixel.clamp(DVec2::ZERO, size);
         let outside = border != pixel && border.distance(pixel) < reach;
-        let Some(front) = Anchor::nearest(borders.iter(), border).filter(|_| outside) else { continue };
-        out.extend(continued(front, pixel, step));
+        let front = Anchor::nearest(borders.iter(), border).filter(|_| outside)?;
         // The front surface may end there, so the next one behind it continues, too.
         let next = borders.iter().chain(&edges).filter(|a| a.inverse(pixel) * BEHIND < front.inverse(pixel));
         let next = Anchor::nearest(next, pixel).filter(|a| a.at.distance(pixel) < reach);
-        out.extend(next.and_then(|a| continued(a, pixel, step)));
-    }
-    for pixel in shown.cells(fine, 0.0).filter(|p| p.x < size.x && p.y < size.y) {
+        Some([continued(front, pixel, step), next.and_then(|a| continued(a, pixel, step))])
+    };
+    let behind = |pixel: DVec2| -> Option<UnseenSplat> {
         let depth = shown.depth_at(pixel.x as usize, pixel.y as usize);
         // Only behind the visible surface: a continuation on it would shine through splats that
         // training leaves transparent.
         let next = Anchor::nearest(edges.iter(), pixel)
             .filter(|a| a.at.distance(pixel) < REVEALED * shown.long())
             .filter(|a| depth.is_some_and(|z| a.inverse(pixel) * z * BEHIND < 1.0));
-        out.extend(next.and_then(|a| continued(a, pixel, fine)));
-    }
-    out
+        next.and_then(|a| continued(a, pixel, fine))
+    };
+    let outer: Vec<DVec2> = shown.cells(step, reach).collect();
+    let inner: Vec<DVec2> = shown.cells(fine, 0.0).filter(|p| p.x < size.x && p.y < size.y).collect();
+    let outer = outer.into_par_iter().flat_map_iter(|pixel| beyond(pixel).into_iter().flatten().flatten());
+    outer.chain(inner.into_par_iter().filter_map(behind)).collect()
 }
 
 /// True where a candidate is in front of or on a surface of another photo, or at a pixel of unknown

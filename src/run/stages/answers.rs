@@ -26,7 +26,10 @@ impl Stage for DecodeViews {
         (trained, language): (&Trained, &TrainedLanguage),
         context: &Context,
     ) -> Result<Vec<DecodedFrame>> {
-        view::decode_all(context.device, &language.splats, &language.field, &trained.cameras)
+        context.progress.begin("decode", trained.cameras.len() as u64);
+        let frames = view::decode_all(context.device, &language.splats, &language.field, &trained.cameras);
+        context.progress.end();
+        frames
     }
 }
 

@@ -13,6 +13,7 @@ use crate::pose::stereo::StereoOptions;
 use crate::pose::{self, Geometry, SparseModel, pointmap, upright};
 use crate::scene::{DepthPrior, Up};
 use crate::{Error, Result};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -67,7 +68,7 @@ impl Cameras {
             CameraOrigin::Network(model) => shared::identity(model)?,
             CameraOrigin::GivenGeometry(geometry) => format!("{geometry:?}"),
         };
-        let photo_identities: Vec<String> = photos.iter().map(identity).collect();
+        let photo_identities: Vec<String> = photos.par_iter().map(identity).collect();
         // Given cameras use no seed: runs that differ in the seed alone share this stage.
         let used_seed = matches!(source, CameraOrigin::Sfm | CameraOrigin::Network(_)).then_some(seed);
         let settings = format!("{source_identity} {photo_identities:?} {used_seed:?}");

@@ -75,7 +75,8 @@ impl Stage for EmbedQueries {
     }
 
     fn run(self, (): (), context: &Context) -> Result<Vec<TextQuery>> {
-        self.encoder.with(|e| {
+        context.progress.begin("texts", self.texts.len() as u64);
+        let queries = self.encoder.with(|e| {
             let queries = ask::queries(&self.texts, e, false)?;
             for text in &self.texts {
                 if let Some(name) = e.embedding_source(text) {
@@ -84,7 +85,9 @@ impl Stage for EmbedQueries {
             }
             e.embedding_warning().iter().for_each(|warning| context.progress.warn(warning));
             Ok(queries)
-        })
+        });
+        context.progress.end();
+        queries
     }
 }
 
@@ -138,9 +141,12 @@ impl Stage for NameCodes {
         self.encoder.identity().to_owned()
     }
 
-    fn run(self, (language,): (&Language,), _: &Context) -> Result<CodeNames> {
+    fn run(self, (language,): (&Language,), context: &Context) -> Result<CodeNames> {
+        context.progress.begin("names", 1);
         // As many as the page shows beside a selected thing.
-        self.encoder.with(|e| ask::names(e, &language.field, ask::NAMES))
+        let names = self.encoder.with(|e| ask::names(e, &language.field, ask::NAMES));
+        context.progress.end();
+        names
     }
 }
 

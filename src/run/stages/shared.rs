@@ -8,6 +8,7 @@ use crate::photo::Photo;
 use crate::pose::{self, Keypoints};
 use crate::scene::{Camera, Coverage, DepthMap, Outside, RgbImage};
 use glam::DVec2;
+use rayon::prelude::*;
 
 /// The working images of photos.
 pub(super) fn images(photos: &[Photo]) -> Vec<RgbImage> {
@@ -17,7 +18,7 @@ pub(super) fn images(photos: &[Photo]) -> Vec<RgbImage> {
 /// Targets of renders and their used pixels. The other pixels continue the used ones, so that no
 /// colour of an occluder gets into the target.
 pub(super) fn targets(photos: &[Photo]) -> (Vec<RgbImage>, Vec<Option<Coverage>>) {
-    photos.iter().map(target).unzip()
+    photos.par_iter().map(target).unzip()
 }
 
 fn target(photo: &Photo) -> (RgbImage, Option<Coverage>) {
