@@ -1,10 +1,13 @@
 //! `report.html`, one self-contained file, readable on a phone.
 use super::chart::escape;
-use super::{Curve, HtmlReport, QueryShown, ViewShown, chart, colour, duration, one_line, viewer};
+use super::{
+    AnswerShown, Curve, HtmlReport, Picture, QueryShown, ViewShown, chart, duration, one_line, viewer,
+};
 use crate::format::picture;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
 use base64::Engine;
+use rayon::prelude::*;
 use std::fmt::Write;
 use std::path::Path;
 
@@ -32,6 +35,11 @@ fn figure(image: &RgbImage, caption: &str) -> Result<String> {
 }
 
 fn page(report: &HtmlReport) -> Result<String> {
+    // The splats and the pictures take most of the time.
+    let (scene, (queries, views)) = rayon::join(
+        || report.scene.as_ref().map(|scene| scene.embedded()).transpose(),
+        || rayon::join(|| queries(report), || joined(report.views.par_iter().map(view_row))),
+    );
     let title = escape(report.title);
     let mut body = format!("<header><h1>{title}</h1><p>{}</p></header>", escape(&report.run.program));
     if !report.run.warnings.is_empty() {
@@ -46,15 +54,12 @@ fn page(report: &HtmlReport) -> Result<String> {
         let _ = write!(body, "<div><b>{}</b><span>{}</span></div>", escape(value), escape(label));
     }
     body.push_str("</section>");
-    if let Some(scene) = &report.scene {
-        let (section, note) = scene.embedded()?;
+    if let Some((section, note)) = scene? {
         let _ = write!(body, "{section}<p class=\"small\">{}</p>", escape(&note));
     }
-    body.push_str(&queries(report)?);
+    body.push_str(&queries?);
     body.push_str("<section><h2>Views</h2>");
-    for view in &report.views {
-        body.push_str(&view_row(view)?);
-    }
+    body.push_str(&views?);
     body.push_str("</section>");
     let charts: String = report.curves.iter().map(curve).collect();
     if !charts.is_empty() {
@@ -83,14 +88,13 @@ fn view_row(v: &ViewShown) -> Result<String> {
         true => String::new(),
         false => format!(", evened out: {}", v.light.summary()),
     };
-    let photo = figure(v.photo, &format!("photo{light}"))?;
-    let mut row = format!("<h3>{}</h3><div class=\"row views\">{photo}", escape(v.name));
+    let mut pictures = vec![(Picture::Plain(v.photo), format!("photo{light}"))];
     if let Some(render) = v.render {
         let caption = v.psnr.map_or("render".to_string(), |p| format!("render, {p:.1} dB"));
-        row.push_str(&figure(render, &caption)?);
+        pictures.push((Picture::Plain(render), caption));
     }
     if let Some(depth) = v.depth {
-        row.push_str(&figure(&colour::depth_image(depth), "depth (near is warm)")?);
+        pictures.push((Picture::Depth(depth), "depth (near is warm)".to_owned()));
     }
     for (level, codes) in v.levels {
         let long = match *level {
@@ -99,10 +103,15 @@ fn view_row(v: &ViewShown) -> Result<String> {
             "l" => "whole things",
             other => other,
         };
-        row.push_str(&figure(&colour::label_image(codes), long)?);
+        pictures.push((Picture::Labels(codes), long.to_owned()));
     }
-    row.push_str("</div>");
-    Ok(row)
+    let figures = joined(pictures.par_iter().map(|(picture, caption)| figure(&picture.image(), caption)))?;
+    Ok(format!("<h3>{}</h3><div class=\"row views\">{figures}</div>", escape(v.name)))
+}
+
+/// The parts in their order, or the first error.
+fn joined(parts: impl IndexedParallelIterator<Item = Result<String>>) -> Result<String> {
+    parts.collect::<Vec<_>>().into_iter().collect()
 }
 
 fn queries(report: &HtmlReport) -> Result<String> {
@@ -118,9 +127,7 @@ fn queries(report: &HtmlReport) -> Result<String> {
         return Ok(out);
     }
     out.push_str("<section><h2>Queries</h2>");
-    for q in &report.queries {
-        out.push_str(&query_row(report, q)?);
-    }
+    out.push_str(&joined(report.queries.par_iter().map(|q| query_row(report, q)))?);
     out.push_str("</section>");
     Ok(out)
 }
@@ -128,19 +135,18 @@ fn queries(report: &HtmlReport) -> Result<String> {
 fn query_row(report: &HtmlReport, q: &QueryShown) -> Result<String> {
     let hits = q.answers.iter().filter(|a| a.found).count();
     let class = if hits > 0 { "yes" } else { "no" };
-    let mut row = format!(
-        "<h3>“{}” <span class=\"{class}\">{}</span></h3><div class=\"row\">",
-        escape(&one_line(q.text)),
-        escape(&q.verdict)
-    );
-    for a in &q.answers {
-        let Some(view) = report.views.get(a.view) else { continue };
+    let heat = |a: &AnswerShown| {
+        let Some(view) = report.views.get(a.view) else { return Ok(String::new()) };
         let verdict = if a.found { "" } else { ", not found" };
         let caption = format!("{}: {:.2} at level {}{verdict}", view.name, a.score, a.level);
-        row.push_str(&figure(&colour::heat_image(view.photo, a.relevancy, a.mask), &caption)?);
-    }
-    row.push_str("</div>");
-    Ok(row)
+        figure(&Picture::Heat(view.photo, a).image(), &caption)
+    };
+    let figures = joined(q.answers.par_iter().map(heat))?;
+    Ok(format!(
+        "<h3>“{}” <span class=\"{class}\">{}</span></h3><div class=\"row\">{figures}</div>",
+        escape(&one_line(q.text)),
+        escape(&q.verdict)
+    ))
 }
 
 fn run_tables(report: &HtmlReport) -> String {
@@ -195,7 +201,7 @@ fn run_tables(report: &HtmlReport) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::{AnswerShown, RunRecord};
+    use super::super::RunRecord;
     use super::*;
     use crate::photo::Light;
     use crate::progress::StageRecord;

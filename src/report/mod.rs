@@ -16,38 +16,60 @@ pub use summary::{duration, table};
 pub use crate::progress::StageRecord;
 
 use crate::format::{create_folder, picture};
-use crate::scene::RgbImage;
+use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
+use rayon::prelude::*;
+use std::borrow::Cow;
 use std::path::Path;
+
+/// A picture of a view.
+enum Picture<'a> {
+    Plain(&'a RgbImage),
+    Depth(&'a Image<f32>),
+    Labels(&'a Image<i32>),
+    /// Answer to a query, over its photo.
+    Heat(&'a RgbImage, &'a AnswerShown<'a>),
+}
+
+impl Picture<'_> {
+    fn image(&self) -> Cow<'_, RgbImage> {
+        match self {
+            Picture::Plain(image) => Cow::Borrowed(*image),
+            Picture::Depth(depth) => Cow::Owned(colour::depth_image(depth)),
+            Picture::Labels(codes) => Cow::Owned(colour::label_image(codes)),
+            Picture::Heat(photo, answer) => {
+                Cow::Owned(colour::heat_image(photo, answer.relevancy, answer.mask))
+            }
+        }
+    }
+}
 
 /// Writes `previews/`: render, depth and levels per view, a heat map per query and view.
 pub fn write_previews(folder: &Path, report: &HtmlReport) -> Result<()> {
     let folder = folder.join("previews");
     create_folder(&folder)?;
-    let save = |name: String, image: &RgbImage| {
-        let path = folder.join(name);
-        std::fs::write(&path, picture::jpeg_bytes(image, 90)?).map_err(Error::unwritable(&path))
-    };
+    let mut pictures: Vec<(String, Picture)> = Vec::new();
     for v in &report.views {
-        if let Some(render) = v.render {
-            save(format!("{}_render.jpg", v.name), render)?;
-        }
-        if let Some(depth) = v.depth {
-            save(format!("{}_depth.jpg", v.name), &colour::depth_image(depth))?;
-        }
-        for (level, codes) in v.levels {
-            save(format!("{}_level_{level}.jpg", v.name), &colour::label_image(codes))?;
-        }
+        pictures.extend(v.render.map(|render| (format!("{}_render.jpg", v.name), Picture::Plain(render))));
+        pictures.extend(v.depth.map(|depth| (format!("{}_depth.jpg", v.name), Picture::Depth(depth))));
+        let levels = v.levels.iter();
+        pictures.extend(
+            levels.map(|(name, codes)| (format!("{}_level_{name}.jpg", v.name), Picture::Labels(codes))),
+        );
     }
     for q in &report.queries {
         for a in &q.answers {
             if let Some(v) = report.views.get(a.view) {
-                let heat = colour::heat_image(v.photo, a.relevancy, a.mask);
-                save(format!("query_{}_{}.jpg", file_name(q.text), v.name), &heat)?;
+                let name = format!("query_{}_{}.jpg", file_name(q.text), v.name);
+                pictures.push((name, Picture::Heat(v.photo, a)));
             }
         }
     }
-    Ok(())
+    let save = |(name, picture): &(String, Picture)| {
+        let path = folder.join(name);
+        std::fs::write(&path, picture::jpeg_bytes(&picture.image(), 90)?).map_err(Error::unwritable(&path))
+    };
+    pictures.par_iter().map(save).collect::<Vec<_>>().into_iter().collect()
 }
 
 /// Converts a text to a part of a file name: letters and digits stay, other characters become `_`.

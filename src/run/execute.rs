@@ -14,7 +14,7 @@ use crate::format::{Workspace, cameras};
 use crate::gpu::Device;
 use crate::infer::{Registry, home};
 use crate::photo::{self, Photo};
-use crate::pipeline::Store;
+use crate::pipeline::{self, Store};
 use crate::progress::{Progress, Recorded};
 use crate::scene::{LanguageField, World};
 use crate::{Error, Result};
@@ -38,8 +38,16 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
         return Err(Error::input("points are in the frame of given cameras; give --init cameras:FILE"));
     }
     let cloud = plan.inputs.points.as_deref().map(|file| points::read(file, progress)).transpose()?;
-    // The device comes first: it limits the size of the photos.
-    let device = plan.machine.open(plan.config.training.deterministic)?;
+    // The device comes before the photos: it limits their size. While it opens, ONNX Runtime is
+    // loaded and the program is read for the keys of the stages, which the graph needs.
+    let device = std::thread::scope(|scope| {
+        scope.spawn(|| {
+            pipeline::program();
+            // The graph reports an error where it needs networks.
+            registry.compute().name().ok()
+        });
+        plan.machine.open(plan.config.training.deterministic)
+    })?;
     let max_size = plan.config.training.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let (mut photos, choice) = match &base {
         Some(base) => (photos::joining(plan, base, &device, max_size, progress)?, None),
@@ -217,9 +225,15 @@ fn write(workspace: Workspace, outcome: &RunOutcome, progress: &dyn Progress) ->
         language: outcome.language.as_ref().map(|l| &l.field),
         text_embeddings: table.as_deref(),
     };
-    scene_dir::write(workspace.path(), &contents)?;
-    progress.step(1, "");
-    summary::write(workspace.path(), outcome)?;
+    let (scene, report) = rayon::join(
+        || {
+            let written = scene_dir::write(workspace.path(), &contents);
+            progress.step(1, "report");
+            written
+        },
+        || summary::write(workspace.path(), outcome),
+    );
+    scene.and(report)?;
     progress.check()?;
     workspace.commit()?;
     progress.end();

@@ -9,6 +9,7 @@ use crate::pose::{Confidence, Fitted};
 use crate::report::viewer::{CodeNames, Scene3d};
 use crate::report::{self, AnswerShown, HtmlReport, QueryShown, ViewShown};
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, Seen, Splats, World};
+use rayon::prelude::*;
 use std::path::Path;
 
 /// A line for every photo that joined a scene.
@@ -196,7 +197,7 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
     let levels: Vec<Vec<_>> =
         o.frames.iter().map(|f| LEVEL_NAMES.into_iter().zip(f.codes.iter().cloned()).collect()).collect();
     // Renders are compared with these.
-    let targets: Vec<RgbImage> = o.photos.iter().map(Photo::target).collect();
+    let targets: Vec<RgbImage> = o.photos.par_iter().map(Photo::target).collect();
     let views = o
         .photos
         .iter()
@@ -222,8 +223,9 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
         figures: figures(o),
         run: &record,
     };
-    report::write_html(folder, &report)?;
-    report::write_previews(folder, &report)
+    let (html, previews) =
+        rayon::join(|| report::write_html(folder, &report), || report::write_previews(folder, &report));
+    html.and(previews)
 }
 
 /// Names of codes for scenes without language.
