@@ -34,13 +34,13 @@ layout(push_constant) uniform Push {
 
 // A group of splats is evaluated pixel by pixel; then each lane sums one splat over one part of the
 // tile: two rows of pixels.
-#define PARTS 4 // the numbers of a vector
-#define PART_ROWS (TILE / PARTS)
+#define TILE_PARTS 4 // the numbers of a vector
+#define PART_ROWS (TILE / TILE_PARTS)
 #define PART_PIXELS (TILE * PART_ROWS)
-#define GROUP (SUBGROUP_SIZE / PARTS)
+#define GROUP (SUBGROUP_SIZE / TILE_PARTS)
 // One number of padding per part: the lanes of a half subgroup then read different banks.
 #define PART_STRIDE (PART_PIXELS + 1)
-#define SPLAT_STRIDE (PARTS * PART_STRIDE)
+#define SPLAT_STRIDE (TILE_PARTS * PART_STRIDE)
 
 // (w, σ) of every splat of a group and pixel.
 shared vec2 factors[GROUP * SPLAT_STRIDE];
@@ -104,7 +104,7 @@ void main() {
         pixel_grad[(y - tile_corner.y) * TILE + x - tile_corner.x] = upstream[k];
     }
     barrier();
-    uint slot = lane / PARTS, part = lane % PARTS;
+    uint slot = lane / TILE_PARTS, part = lane % TILE_PARTS;
     vec4 part_grad[PART_PIXELS];
     [[unroll]] for (int k = 0; k < PART_PIXELS; k++) part_grad[k] = pixel_grad[part * PART_PIXELS + k];
 
@@ -144,15 +144,15 @@ void main() {
             // numbers p, p + 4 and p + 8, so that the four parts add to one vector at a time.
             bool upper = (part & 2u) != 0u, odd = (part & 1u) != 0u;
             [[unroll]] for (int n = 0; n < 2 * GRADIENT_VECTORS; n++) {
-                int at = PARTS * (n / 2) + n % 2;
+                int at = TILE_PARTS * (n / 2) + n % 2;
                 float low = sums[at], high = sums[at + 2];
                 sums[at] = select(upper, high, low) + subgroupShuffleXor(select(upper, low, high), 2);
             }
             uint target = subgroupShuffle(own_item.x, i);
             [[unroll]] for (int n = 0; n < GRADIENT_VECTORS; n++) {
-                float low = sums[PARTS * n], high = sums[PARTS * n + 1];
+                float low = sums[TILE_PARTS * n], high = sums[TILE_PARTS * n + 1];
                 float sum = select(odd, high, low) + subgroupShuffleXor(select(odd, low, high), 1);
-                uint at = PARTS * n + part;
+                uint at = TILE_PARTS * n + part;
                 // Some splats of a list reach no pixel of the tile.
                 if (sum != 0.0 && at < MOMENTS + BASE_CHANNELS)
                     ATOMIC_ADD(projected_grad[GRADIENT_FLOATS * target + at], sum);
