@@ -1,7 +1,7 @@
 #version 450
 // variants: SH_DEGREE=0,1,2,3
-// Projection backward and Adam in one pass, for GPUs: the gradients of the parameters stay in shared
-// memory. First each thread computes the gradient of its splat, then the workgroup moves the
+// Projection backward and Adam in one pass, for GPUs: the gradients of the parameters stay in
+// shared memory. First each thread computes the gradient of its splat, then the workgroup moves the
 // parameters of its splats with their moments, in the order of memory. Equations and reference:
 // pass::project_backward, pass::adam; host: pass::fused_update. Guard, faults and rates as in
 // adam.comp. All stored SH coefficients are used.
@@ -72,8 +72,8 @@ void sh_of(uint i, out float coefficients[3 * SH_COUNT]) {
 #include "shared/project_backward.glsl"
 
 const uint GROUP = gl_WorkGroupSize.x;
-// Gradient of a splat: SH basis, colour, mean, log scale, quaternion, opacity. An odd number of words
-// apart, so that threads that write the same entry of their splats use different banks.
+// Gradient of a splat: SH basis, colour, mean, log scale, quaternion, opacity. An odd number of
+// words apart, so that threads that write the same entry of their splats use different banks.
 const uint COLOUR = SH_COUNT, MEAN = COLOUR + 3, LOG_SCALE = MEAN + 3, QUAT = LOG_SCALE + 3;
 const uint OPACITY = QUAT + 4, ROW = OPACITY + 1 | 1;
 shared float gradients[GROUP * ROW];
@@ -94,8 +94,8 @@ void keep(uint thread, SplatGradient g) {
 const uint SH_BATCH = SH_DEGREE == 0 ? 1 : 3;
 
 // Moves the WIDTH numbers of each of `splats` splats from `first` on, four per thread. GRADIENT and
-// RATE are expressions of `splat`, the word of its gradient, `column` and `row`. A last vector of one
-// or two numbers has one vector of moments.
+// RATE are expressions of `splat`, the word of its gradient, `column` and `row`. A last vector of
+// one or two numbers has one vector of moments.
 #define MOVE(parameters, moments, WIDTH, BATCH, ROW_OF_RATES, GRADIENT, RATE) { \
     uint end = splats * (WIDTH), base = first / 4 * (WIDTH); \
     vec4 row = rates[ROW_OF_RATES]; \

@@ -37,7 +37,7 @@ layout(push_constant) uniform Push {
 // Splats of a batch whose arithmetic overlaps. Splats behind the end of a list reach no pixel.
 #define UNROLLED (!SHARED_SPLATS ? 1 : CHANNELS == BASE_CHANNELS ? 8 : 2)
 
-// A negative T marks a pixel that has stopped, as are pixels beyond the border from the start.
+// A negative T marks a pixel that has stopped; pixels beyond the border have one from the start.
 float T[PIXELS], sum[CHANNELS * PIXELS];
 
 void blend(uint i, vec2 origin) {

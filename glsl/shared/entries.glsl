@@ -38,8 +38,8 @@ void write_entry(uint entry, int row, int x, uint splat) {
     }
 }
 
-// Writes a share of the entries of one splat, which begin at `at`, with a whole subgroup: the
-// batches of SUBGROUP_SIZE entries of `part`, one in `parts`.
+// Writes a share of the entries of one splat, which begin at `at`, with a whole subgroup: every
+// `parts`-th batch of SUBGROUP_SIZE entries, from number `part` on.
 void write_by_subgroup(uint splat, uint at, uint part, uint parts) {
     uint lane = gl_SubgroupInvocationID;
     Ellipse e = ellipse_of(splat, first_row, end_row);

@@ -24,9 +24,9 @@
 
 #include "shared/cutoffs.glsl"
 
-// Subgroups of 32 and more belong to GPUs. There the lanes read a splat from shared memory: one
-// instruction for four numbers, where a shuffle takes one for each. CPU devices take about a
-// microsecond per barrier, so they shuffle.
+// Subgroups of 32 and more belong to GPUs (those with fewer lanes shuffle). There the lanes read a
+// splat from shared memory: one instruction for four numbers, where a shuffle takes one for each.
+// CPU devices take about a microsecond per barrier, so they shuffle.
 #ifndef SHARED_SPLATS
 #define SHARED_SPLATS (SUBGROUP_SIZE >= 32)
 #endif

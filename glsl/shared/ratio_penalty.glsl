@@ -1,5 +1,5 @@
-// Gradient of weight * max(0, s_max/s_min - limit) by the log scales of a splat. The ratio is capped
-// in the gradient so that one degenerate splat cannot overflow.
+// Gradient of weight * max(0, s_max/s_min - limit) by the log scales of a splat. The ratio is
+// capped in the gradient so that one degenerate splat cannot overflow.
 vec3 ratio_gradient(vec3 log_scale, float weight, float limit) {
     vec3 s = log_scale, gradient = vec3(0.0);
     uint high = s.x >= s.y ? (s.x >= s.z ? 0u : 2u) : (s.y >= s.z ? 1u : 2u);

@@ -50,7 +50,7 @@ pub unsafe extern "C" fn svk_context_create(
             let mut chosen = gpu::options(device.as_deref());
             chosen.validation |= options.validation != 0;
             chosen.deterministic = options.deterministic != 0;
-            *slot = boxed(Device::open(&chosen)?, &options)?;
+            *slot = boxed(gpu::open_with(&chosen)?, &options)?;
         }
         Ok(())
     })

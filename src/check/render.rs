@@ -100,7 +100,7 @@ pub(super) fn backward(device: &Device, summation: GradientReduction) -> Found {
     gradients(device, FEATURES, DeviceChoices { summation, ..DeviceChoices::of(device) })
 }
 
-/// Without features: these use shuffles always.
+/// Without features, since blocks of features always use shuffles.
 pub(super) fn tile_sums(device: &Device, tile_sums: TileSums) -> Found {
     let choices =
         DeviceChoices { summation: GradientReduction::Atomics, tile_sums, ..DeviceChoices::of(device) };
@@ -152,6 +152,9 @@ fn gradients(device: &Device, dim: usize, choices: DeviceChoices) -> Found {
 }
 
 pub(super) fn update(device: &Device) -> Found {
+    if !fused_update::fits(device.info()) {
+        return Ok(Ok(format!("not used: the device binds {} buffers", device.info().max_bindings)));
+    }
     let scene = Scene::new(FEATURES);
     let (params, raster) = scene.rendered(device, DeviceChoices::of(device))?;
     let mut random = Random::new(14);

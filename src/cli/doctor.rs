@@ -12,6 +12,7 @@ use crate::photo::{self, Support};
 use crate::run::sources;
 use crate::{Error, Result};
 use serde_json::json;
+use std::collections::BTreeSet;
 use std::fmt::Write;
 
 pub fn doctor(args: &DoctorArgs) -> Result<()> {
@@ -81,8 +82,9 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
 /// Compares every pass with its CPU reference, and disables wrong kernel variants that have a
 /// replacement.
 fn check_passes(args: &DoctorArgs) -> Result<()> {
-    // Without the cache no variant is disabled, and the driver compiles every shader.
-    let options = Options { cache: None, ..gpu::options(args.device.device.as_deref()) };
+    // No variant is disabled, and without the cache the driver compiles every shader.
+    let options =
+        Options { cache: None, disabled: BTreeSet::new(), ..gpu::options(args.device.device.as_deref()) };
     let device = Device::open(&options)?;
     let info = device.info();
     let (low, high) = info.subgroup_sizes;

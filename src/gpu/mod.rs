@@ -7,7 +7,7 @@ pub mod report;
 mod testing;
 
 pub(crate) use folder::FolderCache;
-pub use options::{open, options};
+pub use options::{open, open_with, options};
 pub use splatvk_gpu::*;
 #[doc(hidden)]
 pub use testing::test_device;

@@ -11,9 +11,16 @@ use std::sync::Arc;
 /// # Errors
 /// Those of [`Device::open`], and where `SPLATVK_DISABLE` names no kernel variant.
 pub fn open(choice: Option<&str>) -> crate::Result<Device> {
-    let options = options(choice);
-    check_disabled(&options)?;
-    Ok(Device::open(&options)?)
+    open_with(&options(choice))
+}
+
+/// Opens a device with [`options`] that the caller has changed.
+///
+/// # Errors
+/// As [`open`].
+pub fn open_with(options: &Options) -> crate::Result<Device> {
+    check_disabled(options)?;
+    Ok(Device::open(options)?)
 }
 
 fn check_disabled(options: &Options) -> crate::Result<()> {
@@ -45,7 +52,9 @@ pub fn options(choice: Option<&str>) -> Options {
             .and_then(|v| v.parse::<u64>().ok())
             .map(|mib| mib.saturating_mul(1 << 20)),
         disabled: variable("SPLATVK_DISABLE")
-            .map(|names| names.split(',').map(|name| name.trim().to_owned()).collect())
+            .map(|names| {
+                names.split(',').map(|n| n.trim().to_owned()).filter(|n| !n.is_empty()).collect()
+            })
             .unwrap_or_default(),
         cache: FolderCache::own().map(|cache| Arc::new(cache) as Arc<dyn Cache>),
         ..Options::default()

@@ -40,14 +40,18 @@ pub enum UpdateKernel {
 impl UpdateKernel {
     /// The faster choice for the device, unless it is disabled or the device binds too few buffers.
     pub fn of(info: &DeviceInfo) -> UpdateKernel {
-        let bindings = shaders::fused_update::FAMILY.modules[0].bindings.len() as u32;
         match (if info.is_cpu { KernelVariant::SeparateUpdate } else { KernelVariant::FusedUpdate })
             .or_replacement(info)
         {
-            KernelVariant::FusedUpdate if info.max_bindings >= bindings => UpdateKernel::Fused,
+            KernelVariant::FusedUpdate if fits(info) => UpdateKernel::Fused,
             _ => UpdateKernel::Separate,
         }
     }
+}
+
+/// Whether the device binds the buffers of the fused pass at once.
+pub fn fits(info: &DeviceInfo) -> bool {
+    info.max_bindings >= shaders::fused_update::FAMILY.modules[0].bindings.len() as u32
 }
 
 /// State of Adam for all parameters but the features.

@@ -40,7 +40,7 @@ impl ShGradientKernel {
     }
 }
 
-/// Largest number of workgroups, each with a partial camera gradient: some times as many as a large
+/// Largest number of workgroups, each with a partial camera gradient: several times as many as a large
 /// GPU runs at once (132 processors with 8 to 16 each), so that the last of them end together, or
 /// few enough to start quickly on a few cores.
 pub(super) fn most_groups(device: &Device) -> u32 {

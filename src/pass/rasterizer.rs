@@ -223,7 +223,7 @@ impl Rasterizer {
     pub fn record_forward(&self, rec: &mut Recorder, params: &SplatBuffers, options: &RasterOptions) {
         self.refuse_bands(rec);
         self.record_projection(rec, params, options);
-        self.record_strips(rec, params, &self.frame.bands.get(0), Lists::Cleared);
+        self.record_band(rec, params, &self.frame.bands.get(0));
     }
 
     /// Records the backward pass from `frame().planes_grad` to `gradients` (overwritten; zero for
@@ -263,14 +263,10 @@ impl Rasterizer {
         debug_assert_eq!(sorted.id(), pairs.id(), "an even number of passes sorts in place");
     }
 
-    /// Records binning and blending of a band.
+    /// Records binning and blending of a band; that of band 0 follows
+    /// [`Rasterizer::record_projection`], which clears the lists.
     pub fn record_band(&self, rec: &mut Recorder, params: &SplatBuffers, band: &Band) {
-        self.record_strips(rec, params, band, Lists::Used);
-    }
-
-    /// [`Rasterizer::record_band`], directly after the projection if the lists are cleared.
-    fn record_strips(&self, rec: &mut Recorder, params: &SplatBuffers, band: &Band, first: Lists) {
-        let mut state = first;
+        let mut state = if band.index == 0 { Lists::Cleared } else { Lists::Used };
         for tiles in self.strips(band, band.top..band.top + band.rows) {
             self.record_lists(rec, params, &tiles, state);
             state = Lists::Used;
@@ -434,12 +430,10 @@ impl Rasterizer {
         self.check(params)?;
         loop {
             let mut rec = Recorder::new(&self.device, "forward");
-            let mut state = Lists::Used;
             if band.index == 0 {
                 self.record_projection(&mut rec, params, options);
-                state = Lists::Cleared;
             }
-            self.record_strips(&mut rec, params, band, state);
+            self.record_band(&mut rec, params, band);
             rec.download(&self.frame.status);
             rec.run()?;
             match self.overflow()? {

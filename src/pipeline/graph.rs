@@ -235,7 +235,7 @@ struct State {
     users: Vec<usize>,
     /// Stages whose output is on disk now.
     kept: Vec<&'static str>,
-    /// First output that has no bytes to keep: an error of its codec.
+    /// First error of a codec; that output was not written.
     unsaved: Option<Error>,
     failed: bool,
 }
@@ -300,7 +300,8 @@ impl Shared<'_, '_> {
         Ok(())
     }
 
-    /// Writes an output to the store, after which its checkpoint is of no use.
+    /// Writes an output to the store and then removes its checkpoint. An output that was not written
+    /// keeps it: a resumed run goes on from there.
     fn save(
         &self,
         node: usize,
@@ -312,15 +313,19 @@ impl Shared<'_, '_> {
         let stage = &self.graph.nodes[node];
         let warn = |text: &str| progress.warn(text);
         let kept = (stage.save)(self.store, &self.keys[node], warnings, &value, &warn);
-        let mut state = self.lock();
         match kept {
-            Ok(kept) => state.kept.extend(kept.then_some(stage.name)),
+            Ok(true) => {
+                self.lock().kept.push(stage.name);
+                checkpoint.iter().for_each(Checkpoint::remove);
+            }
+            Ok(false) => {}
             Err(error) => {
+                let mut state = self.lock();
                 state.unsaved.get_or_insert(error);
+                state.failed = true; // no further stage starts
+                self.changed.notify_all();
             }
         }
-        drop(state);
-        checkpoint.iter().for_each(Checkpoint::remove);
     }
 
     /// Waits for the first stage of the lane with all inputs; `None` when no more will run.

@@ -141,6 +141,40 @@ fn unwritable_store_keeps_the_result() {
     assert_eq!(Store::list(folder.path()).len(), files.len());
 }
 
+/// A stage whose output has no bytes.
+struct Unwritable;
+
+impl Stage for Unwritable {
+    const NAME: &'static str = "unwritable";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = ();
+    type Output = u64;
+    fn settings(&self) -> String {
+        String::new()
+    }
+    fn codec() -> Option<Codec<u64>> {
+        Some(Codec { write: |_| Err(Error::work("too large to write")), read: |_| None })
+    }
+    fn run(self, (): (), _: &Context) -> Result<u64> {
+        Ok(1)
+    }
+}
+
+/// The writer runs beside the next stages; its error still ends the run.
+#[test]
+fn codec_errors_end_the_run() {
+    let (machine, folder) = (Machine::new(), tempfile::tempdir().unwrap());
+    let run = |store| {
+        let mut graph = Graph::default();
+        let one = graph.add(Unwritable, ());
+        machine.run(&graph, &[one.target()], &store).map(|(made, _)| *made.get(one).unwrap())
+    };
+    assert_eq!(run(Store::none()).unwrap(), 1);
+    let error = run(Store::at(folder.path(), false, TIMEOUT)).unwrap_err().to_string();
+    assert!(error.contains("too large to write"), "{error}");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
 #[test]
 fn graphs_of_one_store_share_outputs() {
     let (machine, store) = (Machine::new(), Store::in_memory());

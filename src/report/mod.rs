@@ -20,6 +20,7 @@ use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
 use rayon::prelude::*;
 use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// A picture of a view.
@@ -48,7 +49,8 @@ impl Picture<'_> {
 pub fn write_previews(folder: &Path, report: &HtmlReport) -> Result<()> {
     let folder = folder.join("previews");
     create_folder(&folder)?;
-    let mut pictures: Vec<(String, Picture)> = Vec::new();
+    // By name: of two queries whose names of files are equal, the last one stays.
+    let mut pictures: BTreeMap<String, Picture> = BTreeMap::new();
     for v in &report.views {
         pictures.extend(v.render.map(|render| (format!("{}_render.jpg", v.name), Picture::Plain(render))));
         pictures.extend(v.depth.map(|depth| (format!("{}_depth.jpg", v.name), Picture::Depth(depth))));
@@ -61,11 +63,11 @@ pub fn write_previews(folder: &Path, report: &HtmlReport) -> Result<()> {
         for a in &q.answers {
             if let Some(v) = report.views.get(a.view) {
                 let name = format!("query_{}_{}.jpg", file_name(q.text), v.name);
-                pictures.push((name, Picture::Heat(v.photo, a)));
+                pictures.insert(name, Picture::Heat(v.photo, a));
             }
         }
     }
-    let save = |(name, picture): &(String, Picture)| {
+    let save = |(name, picture): (&String, &Picture)| {
         let path = folder.join(name);
         std::fs::write(&path, picture::jpeg_bytes(&picture.image(), 90)?).map_err(Error::unwritable(&path))
     };

@@ -117,7 +117,7 @@ impl Machine {
     }
 
     pub(super) fn open(&self, deterministic: bool) -> Result<Device> {
-        Ok(Device::open(&gpu::Options { deterministic, ..gpu::options(self.device.as_deref()) })?)
+        gpu::open_with(&gpu::Options { deterministic, ..gpu::options(self.device.as_deref()) })
     }
 }
 

@@ -300,7 +300,9 @@ pub fn prune(newest: &Path, extension: &str, capacity: u64) {
         if total <= capacity || path == newest {
             break;
         }
-        if std::fs::remove_file(&path).is_ok() {
+        // Another thread may have removed it.
+        let removed = std::fs::remove_file(&path);
+        if removed.is_ok() || removed.is_err_and(|e| e.kind() == std::io::ErrorKind::NotFound) {
             total -= size;
         }
     }

@@ -87,15 +87,17 @@ fn transferred(
     void: &[bool],
 ) -> Surface {
     let of_view = |(view, areas): (&View, &Vec<(&Area, CellSet)>)| -> Vec<(usize, Vec3)> {
-        let mut open = vec![false; view.width * view.height];
-        for &k in areas.iter().flat_map(|(area, _)| &area.pixels) {
-            open[k] = [0.0, INFERRED].contains(&surface.confidence[view.first + k]) && !void[view.first + k];
-        }
+        let is_open =
+            |k: &usize| [0.0, INFERRED].contains(&surface.confidence[view.first + k]) && !void[view.first + k];
+        let open = OpenPixels::new(
+            areas.iter().flat_map(|(area, _)| &area.pixels).copied().filter(is_open),
+            view.width * view.height,
+        );
         let others: Vec<usize> = (0..views.len()).filter(|other| *other != view.view).collect();
         let seen: Vec<Vec<Option<Vec3>>> =
             others.par_iter().map(|other| view.planes_from(poses, surface, *other, &open)).collect();
-        let at = |k| {
-            let of_others = others.iter().zip(&seen).filter_map(|(other, seen)| Some((*other, seen[k]?)));
+        let at = |(place, &k): (usize, &usize)| {
+            let of_others = others.iter().zip(&seen).filter_map(|(other, seen)| Some((*other, seen[place]?)));
             let mut planes: Vec<(usize, Vec3)> = of_others.collect();
             if planes.is_empty() {
                 return None;
@@ -110,9 +112,10 @@ fn transferred(
             let sound = inverse > 0.0 && !view.point_in_free_space(poses, surface, k, ray / inverse);
             sound.then_some((view.first + k, plane))
         };
-        (0..open.len()).into_par_iter().with_min_len(1024).filter_map(at).collect()
+        open.pixels.par_iter().enumerate().with_min_len(1024).filter_map(at).collect()
     };
-    let found: Vec<(usize, Vec3)> = views.par_iter().zip(areas).flat_map(of_view).collect();
+    // One view after the other: each holds planes of all other views.
+    let found: Vec<(usize, Vec3)> = views.iter().zip(areas).flat_map(of_view).collect();
     let mut out = surface.clone();
     for (k, plane) in found {
         out.planes[k] = plane;
@@ -185,6 +188,31 @@ impl Segmentation {
     }
 }
 
+/// Pixels of a view that take planes of other views.
+struct OpenPixels {
+    /// Ascending.
+    pixels: Vec<usize>,
+    /// Place of every pixel of the view in `pixels`, or `u32::MAX`.
+    places: Vec<u32>,
+}
+
+impl OpenPixels {
+    fn new(pixels: impl Iterator<Item = usize>, of: usize) -> OpenPixels {
+        let mut pixels: Vec<usize> = pixels.collect();
+        pixels.sort_unstable();
+        pixels.dedup();
+        let mut places = vec![u32::MAX; of];
+        for (place, &k) in pixels.iter().enumerate() {
+            places[k] = place as u32;
+        }
+        OpenPixels { pixels, places }
+    }
+
+    fn place(&self, k: usize) -> Option<usize> {
+        Some(self.places[k]).filter(|p| *p != u32::MAX).map(|p| p as usize)
+    }
+}
+
 /// One view with its segmentation.
 struct View<'a> {
     level: &'a Level,
@@ -220,17 +248,17 @@ impl<'a> View<'a> {
         segments.areas.par_iter().filter_map(unmatched).collect()
     }
 
-    /// The nearest inferred plane of another view at each of the view's `open` pixels that shows
-    /// its colour.
+    /// The nearest inferred plane of another view at each of the view's `open` pixels, in their
+    /// order, that shows its colour.
     fn planes_from(
         &self,
         poses: &RelativePoses,
         surface: &Surface,
         other: usize,
-        open: &[bool],
+        open: &OpenPixels,
     ) -> Vec<Option<Vec3>> {
         let (level, r) = (self.level, &self.level.references[other]);
-        let mut seen: Vec<Option<Vec3>> = vec![None; open.len()];
+        let mut seen: Vec<Option<Vec3>> = vec![None; open.pixels.len()];
         for p in 0..(r.width * r.height) as usize {
             let index = r.first as usize + p;
             if surface.confidence[index] != INFERRED {
@@ -242,10 +270,10 @@ impl<'a> View<'a> {
             let k = v as usize * self.width + u as usize;
             let (here, there) = (level.guide[self.view].data[k], level.guide[other].data[p]);
             let colour_distance = (0..3).map(|c| (here[c] - there[c]).powi(2)).sum::<f32>().sqrt();
-            if open[k] && colour_distance < COLOUR_TOLERANCE {
+            if let Some(place) = open.place(k).filter(|_| colour_distance < COLOUR_TOLERANCE) {
                 let plane = poses.plane(other, self.view, surface.planes[index]);
                 let ray = ray(level, self.view, k % self.width, k / self.width);
-                let nearest = seen[k].get_or_insert(plane);
+                let nearest = seen[place].get_or_insert(plane);
                 if plane.dot(ray) > nearest.dot(ray) {
                     *nearest = plane;
                 }
