@@ -52,9 +52,7 @@ pub fn options(choice: Option<&str>) -> Options {
             .and_then(|v| v.parse::<u64>().ok())
             .map(|mib| mib.saturating_mul(1 << 20)),
         disabled: variable("SPLATVK_DISABLE")
-            .map(|names| {
-                names.split(',').map(|n| n.trim().to_owned()).filter(|n| !n.is_empty()).collect()
-            })
+            .map(|names| names.split(',').map(|n| n.trim().to_owned()).filter(|n| !n.is_empty()).collect())
             .unwrap_or_default(),
         cache: FolderCache::own().map(|cache| Arc::new(cache) as Arc<dyn Cache>),
         ..Options::default()

@@ -87,8 +87,9 @@ fn transferred(
     void: &[bool],
 ) -> Surface {
     let of_view = |(view, areas): (&View, &Vec<(&Area, CellSet)>)| -> Vec<(usize, Vec3)> {
-        let is_open =
-            |k: &usize| [0.0, INFERRED].contains(&surface.confidence[view.first + k]) && !void[view.first + k];
+        let is_open = |k: &usize| {
+            [0.0, INFERRED].contains(&surface.confidence[view.first + k]) && !void[view.first + k]
+        };
         let open = OpenPixels::new(
             areas.iter().flat_map(|(area, _)| &area.pixels).copied().filter(is_open),
             view.width * view.height,
