@@ -263,8 +263,8 @@ impl Rasterizer {
         debug_assert_eq!(sorted.id(), pairs.id(), "an even number of passes sorts in place");
     }
 
-    /// Records binning and blending of a band; that of band 0 follows
-    /// [`Rasterizer::record_projection`], which clears the lists.
+    /// Records binning and blending of a band. In a recording, band 0 directly follows
+    /// [`Rasterizer::record_projection`], which clears its lists.
     pub fn record_band(&self, rec: &mut Recorder, params: &SplatBuffers, band: &Band) {
         let mut state = if band.index == 0 { Lists::Cleared } else { Lists::Used };
         for tiles in self.strips(band, band.top..band.top + band.rows) {

@@ -238,9 +238,13 @@ pub fn in_bands(
         record(&mut rec);
         rec.run().unwrap();
     };
-    run(&|rec| raster.record_projection(rec, &params, &scene.options));
     for band in bands.iter() {
-        run(&|rec| raster.record_band(rec, &params, &band));
+        run(&|rec| {
+            if band.index == 0 {
+                raster.record_projection(rec, &params, &scene.options);
+            }
+            raster.record_band(rec, &params, &band);
+        });
         raster.frame().planes_grad.write(&bands.cut_inner(&band, upstream, 0.0)).unwrap();
         run(&|rec| raster.record_band_backward(rec, &params, &scene.options, &band));
     }
