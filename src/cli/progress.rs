@@ -245,7 +245,7 @@ impl Progress for Terminal {
             Some(bars) => bars.add(ProgressBar::new(steps)),
             None => ProgressBar::hidden(),
         };
-        if let Ok(style) = ProgressStyle::with_template("{msg:>12} {wide_bar} {pos}/{len} {prefix} {left}") {
+        if let Ok(style) = ProgressStyle::with_template("{msg:>15} {wide_bar} {pos}/{len} {prefix} {left}") {
             bar.set_style(style.with_key("left", time_left));
         }
         bar.set_message(stage);
@@ -262,7 +262,8 @@ impl Progress for Terminal {
         let Some((name, start, bar)) = lock(&self.current).take() else { return };
         let note = bar.prefix();
         bar.finish_and_clear();
-        print(&format!("{name:>12}  {:6.1} s  {note}", start.elapsed().as_secs_f64()));
+        let line = format!("{name:>15}  {:6.1} s  {note}", start.elapsed().as_secs_f64());
+        print(line.trim_end());
     }
     fn warn(&self, message: &str) {
         print(&format!("warning: {}", one_line(message)));
