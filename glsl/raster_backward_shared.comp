@@ -23,7 +23,7 @@ layout(std430, binding = 4) readonly buffer PlanesGrad { float planes_grad[]; };
 layout(std430, binding = 5) readonly buffer Transmittance { float transmittances[]; };  // [H, W]
 // [N, GRADIENT_FLOATS], added to.
 layout(std430, binding = 6) buffer ProjectedGrad { ATOMIC_FLOAT projected_grad[]; };
-// As in raster_backward.comp.
+// Fields of raster_backward.comp.
 layout(push_constant) uniform Push {
     uint width; uint top; uint rows; uint first_row; uint list_row; uint tiles_x; uint alpha_plane;
 };

@@ -74,7 +74,7 @@ fn bench_training_times_add_up() {
     }
 }
 
-/// As on a GPU.
+/// The kernels that a GPU takes.
 #[test]
 fn bench_measures_fused_update() {
     let disabled = [KernelVariant::SeparateUpdate.name().to_owned()].into();

@@ -4,7 +4,7 @@ use super::model::Roofline;
 use super::report::Section;
 use crate::Result;
 use crate::gpu::{Device, Recorder, shaders};
-use crate::pass::adam::rows_of_groups;
+use crate::pass::adam::rows_of_threads;
 
 /// vec4 per thread in `glsl/bench_copy.comp`.
 const COPY_STEPS: usize = shaders::bench_copy::STEPS as usize;
@@ -33,7 +33,7 @@ fn copy(device: &Device, budget: &Budget, section: &mut Section) -> Result<f64> 
         let mut rec = Recorder::new(device, "copy bandwidth");
         rec.pass("copy by shader");
         let bindings = shaders::bench_copy::Bindings { source: &from, target: &to };
-        rec.dispatch(shaders::bench_copy::call(&bindings), rows_of_groups(vectors / COPY_STEPS));
+        rec.dispatch(shaders::bench_copy::call(&bindings), rows_of_threads(vectors / COPY_STEPS));
         rec.pass("copy by command");
         rec.copy(&from, &to);
         rec
@@ -102,7 +102,7 @@ mod tests {
         let values = device.buffer_from("values", &[4.0f32; 64]).unwrap();
         let mut rec = Recorder::new(&device, "limits");
         let bindings = shaders::bench_copy::Bindings { source: &from, target: &to };
-        rec.dispatch(shaders::bench_copy::call(&bindings), rows_of_groups(n / COPY_STEPS));
+        rec.dispatch(shaders::bench_copy::call(&bindings), rows_of_threads(n / COPY_STEPS));
         let bindings = shaders::bench_fma::Bindings { values: &values };
         rec.dispatch(shaders::bench_fma::call(&bindings), [1, 1, 1]);
         rec.run().unwrap();

@@ -17,7 +17,7 @@ pub fn open(choice: Option<&str>) -> crate::Result<Device> {
 /// Opens a device with [`options`] that the caller has changed.
 ///
 /// # Errors
-/// As [`open`].
+/// Those of [`open`].
 pub fn open_with(options: &Options) -> crate::Result<Device> {
     check_disabled(options)?;
     Ok(Device::open(options)?)

@@ -1,5 +1,6 @@
 //! Adam on the GPU (Kingma & Ba 2015). The host sets a learning rate per parameter class before
 //! each step.
+use super::sort::rows_of_groups;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 
@@ -10,12 +11,10 @@ pub const EPSILON: f64 = shaders::shared::adam::EPS;
 /// Threads per workgroup in `glsl/adam.comp` and `glsl/gather.comp`.
 const GROUP: usize = shaders::adam::WORKGROUP[0] as usize;
 
-/// Workgroup counts for `threads` in a shader that numbers its workgroups row by row: at most 32768
-/// per row, since a dimension may be limited to 65535.
-pub(crate) fn rows_of_groups(threads: usize) -> [u32; 3] {
-    let groups = threads.div_ceil(GROUP).max(1);
-    let row = groups.min(32768);
-    [row as u32, groups.div_ceil(row) as u32, 1]
+/// Workgroup counts for `threads` in a shader with workgroups of this size that numbers them row by
+/// row.
+pub(crate) fn rows_of_threads(threads: usize) -> [u32; 3] {
+    rows_of_groups(threads.div_ceil(GROUP))
 }
 
 /// The moving averages of one parameter buffer: `[count]` pairs (m, v).
@@ -104,7 +103,7 @@ impl Schedule {
                 slot: class.slot,
             },
         );
-        rec.dispatch(call, rows_of_groups(class.count.div_ceil(4)));
+        rec.dispatch(call, rows_of_threads(class.count.div_ceil(4)));
     }
 }
 
@@ -199,9 +198,9 @@ mod tests {
     }
 
     #[test]
-    fn rows_of_groups_cover_all_threads() {
+    fn rows_of_workgroups_cover_all_threads() {
         for threads in [1, 256, 257, 8_388_608, 8_388_609, 50_000_000] {
-            let [x, y, _] = rows_of_groups(threads);
+            let [x, y, _] = rows_of_threads(threads);
             assert!(x as usize * y as usize * GROUP >= threads && x <= 32768 && y <= 65535);
         }
     }

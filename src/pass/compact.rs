@@ -1,6 +1,6 @@
 //! Pruning and compaction: chooses the splats to keep and moves their rows of parameters and
 //! optimiser state together.
-use super::adam::rows_of_groups;
+use super::adam::rows_of_threads;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use bytemuck::Pod;
@@ -32,7 +32,7 @@ pub fn gather<T: Pod>(
         &shaders::gather::Bindings { index, from: &from.cast(), to: &to },
         &shaders::gather::Push { rows: rows as u32, stride: stride as u32 },
     );
-    rec.dispatch(call, rows_of_groups(rows * stride));
+    rec.dispatch(call, rows_of_threads(rows * stride));
     rec.run()?;
     Ok(to.cast())
 }
@@ -69,7 +69,7 @@ mod tests {
     fn gather_beyond_workgroup_row_is_complete() {
         let device = crate::gpu::test_device();
         let (stride, index) = (1usize << 16, [0u32, 1].repeat(65));
-        assert!(rows_of_groups(index.len() * stride)[1] > 1);
+        assert!(rows_of_threads(index.len() * stride)[1] > 1);
         let rows: Vec<u32> = (1..=2 * stride as u32).collect();
         let from = device.buffer_from("rows", &rows).unwrap();
         let index_buffer = device.buffer_from("index", &index).unwrap();

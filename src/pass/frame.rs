@@ -123,10 +123,7 @@ pub enum TileSums {
 impl TileSums {
     /// The faster reduction for the device, unless it is disabled.
     pub fn of(device: &Device) -> TileSums {
-        let info = device.info();
-        match (if info.is_cpu { KernelVariant::ShuffledSums } else { KernelVariant::SharedSums })
-            .or_replacement(info)
-        {
+        match KernelVariant::faster(device.info(), KernelVariant::ShuffledSums, KernelVariant::SharedSums) {
             KernelVariant::ShuffledSums => TileSums::Shuffles,
             _ => TileSums::Shared,
         }

@@ -40,9 +40,7 @@ pub enum UpdateKernel {
 impl UpdateKernel {
     /// The faster choice for the device, unless it is disabled or the device binds too few buffers.
     pub fn of(info: &DeviceInfo) -> UpdateKernel {
-        match (if info.is_cpu { KernelVariant::SeparateUpdate } else { KernelVariant::FusedUpdate })
-            .or_replacement(info)
-        {
+        match KernelVariant::faster(info, KernelVariant::SeparateUpdate, KernelVariant::FusedUpdate) {
             KernelVariant::FusedUpdate if fits(info) => UpdateKernel::Fused,
             _ => UpdateKernel::Separate,
         }

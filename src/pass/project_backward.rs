@@ -30,19 +30,16 @@ pub enum ShGradientKernel {
 impl ShGradientKernel {
     /// The faster kernel for the device, unless it is disabled.
     pub fn of(device: &Device) -> ShGradientKernel {
-        let info = device.info();
-        match (if info.is_cpu { KernelVariant::ShPerThread } else { KernelVariant::ShShared })
-            .or_replacement(info)
-        {
+        match KernelVariant::faster(device.info(), KernelVariant::ShPerThread, KernelVariant::ShShared) {
             KernelVariant::ShPerThread => ShGradientKernel::PerThread,
             _ => ShGradientKernel::Shared,
         }
     }
 }
 
-/// Largest number of workgroups, each with a partial camera gradient: several times as many as a large
-/// GPU runs at once (132 processors with 8 to 16 each), so that the last of them end together, or
-/// few enough to start quickly on a few cores.
+/// Largest number of workgroups, each with a partial camera gradient: several times as many as a
+/// large GPU runs at once (132 processors with 8 to 16 each), so that the last of them end
+/// together, or few enough to start quickly on a few cores.
 pub(super) fn most_groups(device: &Device) -> u32 {
     if device.info().is_cpu { 64 } else { 8192 }
 }

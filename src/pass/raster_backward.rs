@@ -10,7 +10,7 @@
 //! With σ = ∂α · α (0 where α was clamped), the shader only sums six moments: Σσ, Σσdx, Σσdy,
 //! Σσdx², Σσdxdy, Σσdy². Every geometry gradient follows per splat: ∂o = m₀/o, ∂(u, v) = −(A m₁ + B
 //! m₂, C m₂ + B m₁), ∂(A, B, C) = (−½ m₃, −m₄, −½ m₅).
-use super::adam::rows_of_groups;
+use super::adam::rows_of_threads;
 use super::channels::{BASE_CHANNELS, Block, blocks};
 use super::frame::{EntryBuffers, FrameBuffers, GRADIENT_FLOATS, GradientReduction, TileSums, Tiles};
 use super::raster_forward::{Cutoffs, ReferenceScene, channels_of, push, walk};
@@ -203,7 +203,7 @@ fn record_sum(
             add: u32::from(add),
         },
     );
-    rec.dispatch(call, rows_of_groups(count * vectors as usize));
+    rec.dispatch(call, rows_of_threads(count * vectors as usize));
 }
 
 /// Gradient by one screen-space splat, in the layout of the GPU buffer.

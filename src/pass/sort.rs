@@ -24,10 +24,7 @@ pub enum SortAlgorithm {
 impl SortAlgorithm {
     /// The faster algorithm for the device, unless it is disabled.
     pub fn of(device: &Device) -> SortAlgorithm {
-        let info = device.info();
-        match (if info.is_cpu { KernelVariant::ChunkSort } else { KernelVariant::SweepSort })
-            .or_replacement(info)
-        {
+        match KernelVariant::faster(device.info(), KernelVariant::ChunkSort, KernelVariant::SweepSort) {
             KernelVariant::ChunkSort => SortAlgorithm::Chunks,
             _ => SortAlgorithm::Sweep,
         }
@@ -259,7 +256,8 @@ fn record_chunks(
     );
 }
 
-/// At least this many workgroups, and at least one; a dimension may be limited to 65535.
+/// Workgroup counts for at least `groups` workgroups, and at least one, that a shader numbers row by
+/// row: at most 32768 per row, since a dimension may be limited to 65535.
 pub(super) fn rows_of_groups(groups: usize) -> [u32; 3] {
     let groups = groups.max(1);
     let row = groups.min(32768);

@@ -152,10 +152,7 @@ pub enum SsimRowKernel {
 impl SsimRowKernel {
     /// The faster kernel for the device, unless it is disabled.
     pub fn of(device: &Device) -> SsimRowKernel {
-        let info = device.info();
-        match (if info.is_cpu { KernelVariant::SsimStrips } else { KernelVariant::SsimShared })
-            .or_replacement(info)
-        {
+        match KernelVariant::faster(device.info(), KernelVariant::SsimStrips, KernelVariant::SsimShared) {
             KernelVariant::SsimStrips => SsimRowKernel::Strips,
             _ => SsimRowKernel::Shared,
         }

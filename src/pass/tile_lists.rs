@@ -21,10 +21,7 @@ pub enum TileBinning {
 impl TileBinning {
     /// The faster method for the device, unless it is disabled.
     pub fn of(device: &Device) -> TileBinning {
-        let info = device.info();
-        match (if info.is_cpu { KernelVariant::CountedLists } else { KernelVariant::SortedLists })
-            .or_replacement(info)
-        {
+        match KernelVariant::faster(device.info(), KernelVariant::CountedLists, KernelVariant::SortedLists) {
             KernelVariant::CountedLists => TileBinning::Counting,
             _ => TileBinning::Sorting,
         }

@@ -102,6 +102,12 @@ impl KernelVariant {
         }
     }
 
+    /// The faster of two variants that replace each other, by the kind of device, unless it is
+    /// disabled.
+    pub fn faster(info: &DeviceInfo, on_cpu: KernelVariant, on_gpu: KernelVariant) -> KernelVariant {
+        (if info.is_cpu { on_cpu } else { on_gpu }).or_replacement(info)
+    }
+
     /// This variant, or its replacement where it alone is disabled.
     pub fn or_replacement(self, info: &DeviceInfo) -> KernelVariant {
         let other = self.replacement();

@@ -181,7 +181,7 @@ pub fn lists_by_counting(device: &Device) {
     assert!(total > 50 && extra * 20 < total, "{extra} of {total}");
 }
 
-/// As [`lists_by_counting`], with several chunks of splats, and with splats of every size: those of
+/// [`lists_by_counting`] with several chunks of splats, and with splats of every size: those of
 /// a thread, of a subgroup and of the whole device.
 pub fn lists_by_sorting(device: &Device) {
     assert_lists(device, &scene(600, 0, 0, 1054));
