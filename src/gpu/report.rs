@@ -102,7 +102,7 @@ fn describe(info: &DeviceInfo, lines: &mut Vec<Line>) {
     if !info.disabled.is_empty() {
         let names: Vec<&str> = info.disabled.iter().map(String::as_str).collect();
         let advice =
-            "doctor --check found wrong results, until an update of the driver, or SPLATVK_DISABLE names it";
+            "by doctor --check (wrong results; an update of the driver starts anew) or by SPLATVK_DISABLE";
         lines.push(line("switched off", Status::Note, names.join(", "), Some(advice)));
     }
     let mib = |bytes: u64| bytes >> 20;
