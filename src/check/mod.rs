@@ -6,10 +6,10 @@ mod images;
 mod render;
 
 use crate::Result;
-use crate::gpu::{Device, Options};
+use crate::gpu::{Device, KernelVariant, Options};
 use crate::pass::sort::SortAlgorithm;
 use crate::pass::ssim_l1::SsimRowKernel;
-use crate::pass::{GradientReduction, KernelVariant, ShGradientKernel, TileBinning, TileSums};
+use crate::pass::{GradientReduction, ShGradientKernel, TileBinning, TileSums};
 use compared::Found;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};

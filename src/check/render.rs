@@ -1,6 +1,6 @@
 //! Checks of rendering and its gradients.
 use super::compared::{Found, close, equal, worst};
-use crate::gpu::{Device, Recorder};
+use crate::gpu::{Device, KernelVariant, Recorder};
 use crate::math::Random;
 use crate::pass::adam::{BETA, Moments, Schedule, adam};
 use crate::pass::close::{IMAGE, Tolerance, gradient_tolerance};
@@ -9,8 +9,8 @@ use crate::pass::params::Params;
 use crate::pass::raster_forward::Cutoffs;
 use crate::pass::reference::{self, Forward};
 use crate::pass::{
-    DeviceChoices, FeatureMode, GradientReduction, KernelVariant, RasterOptions, Rasterizer,
-    ShGradientKernel, SplatBuffers, TileBinning, TileSums, View,
+    DeviceChoices, FeatureMode, GradientReduction, RasterOptions, Rasterizer, ShGradientKernel, SplatBuffers,
+    TileBinning, TileSums, View,
     regularise::{self, RatioPenalty},
 };
 use crate::scene::Splats;

@@ -212,8 +212,7 @@ mod tests {
         LanguageOptions, LanguageRun, Photos, Preset, RgbOptions, RgbRun, pose::PoseOptions,
         scale::SceneScale, schedule::Exponential,
     };
-    use crate::gpu::{Device, Options, TestDevice};
-    use crate::pass::KernelVariant;
+    use crate::gpu::{Device, KernelVariant, Options, TestDevice};
     use crate::scene::seeded;
     use crate::scene::{Camera, Codebook, Image, LevelField, Pose, RgbImage, Splats};
     use glam::DVec3;

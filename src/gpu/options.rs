@@ -1,7 +1,6 @@
 //! Options of a device from the environment.
-use super::folder::FolderCache;
+use super::{KernelVariant, folder::FolderCache};
 use crate::Error;
-use crate::pass::KernelVariant;
 use splatvk_gpu::{Cache, Device, Options};
 use std::sync::Arc;
 
@@ -38,7 +37,7 @@ fn check_disabled(options: &Options) -> crate::Result<()> {
 /// `SPLATVK_VALIDATION=1` turns the validation layer on, `gpu` its GPU-assisted checks, too.
 /// `SPLATVK_STAGING=1` keeps buffers out of host-visible memory. `SPLATVK_MAX_BINDING` limits the
 /// size of a buffer, MiB. `SPLATVK_DISABLE` names kernel variants to disable, separated by commas
-/// ([`crate::pass::KernelVariant::name`]). The cache is a folder of the program, where it has one.
+/// ([`KernelVariant::name`]). The cache is a folder of the program, where it has one.
 pub fn options(choice: Option<&str>) -> Options {
     let variable = |name: &str| std::env::var(name).ok().filter(|v| !v.is_empty());
     let validation = variable("SPLATVK_VALIDATION");

@@ -4,8 +4,7 @@ use super::bands::Bands;
 use super::channels::{Block, blocks};
 use super::tile_lists::{TILE, TileLists};
 use crate::Result;
-use crate::gpu::{self, Buffer, Device, shaders};
-use crate::pass::KernelVariant;
+use crate::gpu::{self, Buffer, Device, KernelVariant, shaders};
 use crate::sync::lock;
 use std::ops::Range;
 

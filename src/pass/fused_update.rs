@@ -10,8 +10,7 @@ use super::project_backward::{groups, record_camera};
 use super::regularise::{RatioPenalty, ratio_penalty};
 use super::splat_buffers::SplatBuffers;
 use crate::gpu::shaders::structs::CameraView;
-use crate::gpu::{Buffer, DeviceInfo, Recorder, shaders};
-use crate::pass::KernelVariant;
+use crate::gpu::{Buffer, DeviceInfo, KernelVariant, Recorder, shaders};
 use crate::scene::sh_coefficients;
 
 /// Rows of the [`Schedule`], and places in the array of moments, of the parameter classes: means,

@@ -30,7 +30,6 @@ pub mod splat_buffers;
 pub mod ssim_l1;
 pub mod sum;
 pub mod tile_lists;
-pub mod variants;
 pub mod view;
 
 pub use frame::{FrameBuffers, GradientReduction, TileSums};
@@ -41,7 +40,6 @@ pub use rasterizer::{DeviceChoices, Rasterizer};
 pub use renderer::{RenderedFrame, Renderer};
 pub use splat_buffers::SplatBuffers;
 pub use tile_lists::TileBinning;
-pub use variants::KernelVariant;
 pub use view::View;
 
 #[cfg(test)]

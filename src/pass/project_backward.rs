@@ -13,8 +13,7 @@ use super::raster_backward::SplatGradient;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::structs::CameraView;
-use crate::gpu::{Buffer, Device, Recorder, shaders};
-use crate::pass::KernelVariant;
+use crate::gpu::{Buffer, Device, KernelVariant, Recorder, shaders};
 use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 

@@ -9,8 +9,7 @@
 //! decoupled look-back, and counts a predecessor itself where that makes no progress. Both are
 //! correct on any device and any subgroup size.
 use crate::Result;
-use crate::gpu::{Buffer, Device, LOOP_ROUNDS, Recorder, shaders};
-use crate::pass::KernelVariant;
+use crate::gpu::{Buffer, Device, KernelVariant, LOOP_ROUNDS, Recorder, shaders};
 
 /// Algorithm of the radix sort.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

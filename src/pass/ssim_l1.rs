@@ -10,8 +10,7 @@ use super::bands::{Band, Bands};
 use super::sum;
 use crate::Result;
 use crate::gpu::shaders::shared::ssim::{self as shared, C1, C2};
-use crate::gpu::{Buffer, Device, Recorder, shaders};
-use crate::pass::KernelVariant;
+use crate::gpu::{Buffer, Device, KernelVariant, Recorder, shaders};
 use serde::{Deserialize, Serialize};
 
 /// Taps of the SSIM window.

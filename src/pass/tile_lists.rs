@@ -2,8 +2,7 @@
 use super::scan::Scan;
 use super::sort::{Sort, SortAlgorithm};
 use crate::Result;
-use crate::gpu::{Buffer, Device, LOOP_ROUNDS, shaders};
-use crate::pass::KernelVariant;
+use crate::gpu::{Buffer, Device, KernelVariant, LOOP_ROUNDS, shaders};
 
 /// Tile edge, pixels. Tiles of 8 evaluate 2.9 times the pairs that they blend, tiles of 16 six
 /// times (measured on the seeded scene).

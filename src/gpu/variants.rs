@@ -1,5 +1,5 @@
 //! Kernel variants that compute the same. One replaces another that gave wrong results on a device.
-use crate::gpu::{DeviceInfo, NATIVE_FLOAT_ATOMICS};
+use splatvk_gpu::{DeviceInfo, NATIVE_FLOAT_ATOMICS};
 
 /// One of two or more implementations of a pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
