@@ -189,7 +189,7 @@ fn submissions_hold_the_hosts_queue_lock() {
     assert_eq!(numbers.read().unwrap(), [7; 4]);
     assert!(device.submissions() > 0);
     assert_eq!(locked.load(Ordering::Relaxed), device.submissions());
-    drop(device);
+    drop((numbers, device));
     // SAFETY: nothing made from them is left.
     unsafe {
         raw.destroy_device(None);
