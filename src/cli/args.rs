@@ -133,6 +133,15 @@ pub struct TrainArgs {
     pub device: DeviceArgs,
 }
 
+/// Views of `render --path`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum PathKind {
+    /// The photos' cameras from left to right, with three views between neighbours
+    Photos,
+    /// 10° and 20° to the left and right of the photos, 15° above and 10° below, nearer and further
+    Beyond,
+}
+
 /// Outputs of `render`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Channel {
@@ -167,8 +176,14 @@ pub struct RenderArgs {
     /// Scene directory, or a file of Gaussians (.ply, .splat, .spz, .glb, .gltf)
     pub scene: PathBuf,
     /// Cameras: transforms.json, a COLMAP model folder, or cameras.json
-    #[arg(long, value_name = "FILE")]
-    pub cameras: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "path", conflicts_with = "path")]
+    pub cameras: Option<PathBuf>,
+    /// Views along a path instead of given cameras, with a sheet of all, and their opacity and colours
+    #[arg(long, value_enum)]
+    pub path: Option<PathKind>,
+    /// Also a video along the path: path.mp4
+    #[arg(long, requires = "path")]
+    pub video: bool,
     /// Folder for the images
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,

@@ -11,6 +11,7 @@ mod line;
 mod measure;
 mod models;
 pub mod outputs;
+mod path;
 pub mod print;
 pub mod progress;
 mod query;

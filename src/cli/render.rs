@@ -1,7 +1,8 @@
 //! `splatvk render`
 use super::args::{Channel, ImageFormat, RenderArgs};
 use super::outputs::WrittenFiles;
-use super::print::listing;
+use super::path::PathOutput;
+use super::print::{listing, print, print_json};
 use super::progress;
 use super::scene;
 use super::views;
@@ -9,15 +10,19 @@ use crate::format::npy::{self, NpyArray};
 use crate::format::picture::{self, Planes};
 use crate::gpu;
 use crate::report::colour;
+use crate::run::path::PathViews;
 use crate::run::view::{DecodedFrame, UnseenShare, Viewer};
 use crate::scene::{Image, LEVEL_NAMES, LanguageField, RgbImage, to_linear};
 use crate::{Error, Result};
+use serde_json::json;
+use std::path::{Path, PathBuf};
 
 pub fn render(args: &RenderArgs) -> Result<()> {
-    let mut out = WrittenFiles::open(&args.out, args.force, &[&args.scene, &args.cameras])?;
+    let inputs: Vec<&Path> =
+        std::iter::once(&args.scene).chain(&args.cameras).map(PathBuf::as_path).collect();
+    let mut out = WrittenFiles::open(&args.out, args.force, &inputs)?;
     let scene = scene::load(&args.scene)?;
-    let cameras = views::read(&args.cameras)?;
-    let stems = views::stems(&cameras)?;
+    let given = args.cameras.as_deref().map(views::read).transpose()?;
     let wants_language = args.channels.iter().any(|c| matches!(c, Channel::Features | Channel::Codes));
     if wants_language && scene.language.is_none() {
         return Err(Error::input(format!(
@@ -39,6 +44,15 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     let mut viewer = Viewer::new(&device, &scene.splats, field)?;
     let mut unseen =
         wants_unseen.then(|| UnseenShare::new(&device, &scene.splats, &scene.seen)).transpose()?;
+    let mut path = match args.path {
+        Some(kind) => {
+            let views = PathViews::new(&mut viewer, &scene.cameras, &scene.world)?;
+            Some(PathOutput::new(kind.into(), views))
+        }
+        None => None,
+    };
+    let cameras = path.as_ref().map(PathOutput::cameras).or(given).unwrap_or_default();
+    let stems = views::stems(&cameras)?;
     let progress = progress::reporter();
     progress.begin("render", cameras.len() as u64);
     for (i, (camera, stem)) in cameras.iter().zip(&stems).enumerate() {
@@ -48,6 +62,9 @@ pub fn render(args: &RenderArgs) -> Result<()> {
         } else {
             viewer.view(camera)?
         };
+        if let Some(path) = &mut path {
+            path.add(camera, &view);
+        }
         let unseen = unseen.as_mut().map(|u| u.view(camera)).transpose()?;
         let view = View { decoded: &view, unseen: unseen.as_ref() };
         for format in &args.formats {
@@ -60,7 +77,17 @@ pub fn render(args: &RenderArgs) -> Result<()> {
         progress.step(i as u64 + 1, "");
     }
     progress.end();
-    listing(&out.keep()?, args.device.json)
+    let Some(path) = path else { return listing(&out.keep()?, args.device.json) };
+    path.write_sheet(&mut out)?;
+    if args.video {
+        path.write_video(&mut viewer, &mut out, progress.as_ref())?;
+    }
+    let files = out.keep()?;
+    if args.device.json {
+        return print_json(&json!({ "files": files, "views": path.json() }));
+    }
+    print(&path.table())?;
+    listing(&files, false)
 }
 
 /// Output of one camera.

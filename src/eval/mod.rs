@@ -9,6 +9,7 @@ mod figures;
 mod instances;
 mod lengths;
 mod report;
+mod shown;
 mod text;
 mod truth;
 
@@ -19,9 +20,10 @@ pub use figures::{DepthScore, colour_fit, depth_score, iou};
 pub use instances::InstanceScore;
 pub use lengths::LengthScore;
 pub use report::{
-    EvalReport, ImageScore, MaskScore, PairScore, PoseScore, RefinedScore, RefinedView, RelativeScore,
-    SplitSummary,
+    EvalReport, FrameShown, ImageScore, MaskScore, PairScore, PoseScore, RefinedScore, RefinedView,
+    RelativeScore, SplitSummary,
 };
+pub use shown::{PhotoView, ShownScore, on_white, shown_pixels, shown_score};
 pub use truth::{GroundTruth, ObjectMaps, Split, TruthFrame};
 
 use crate::format::picture;
@@ -97,6 +99,8 @@ pub struct Evaluation {
     out: Option<PathBuf>,
     /// Surface points in train frames: (scene, truth).
     surface: Vec<(DVec3, DVec3)>,
+    /// The train frames with true depth.
+    photos: Vec<PhotoView>,
     /// Mean true depth.
     mean_depth: f64,
     report: EvalReport,
@@ -137,7 +141,17 @@ impl Evaluation {
         let (similarity, intrinsics_offset) =
             (errors.similarity, IntrinsicsOffset::between(&estimated, &known));
         let out = out.map(Path::to_path_buf);
-        Ok(Evaluation { similarity, intrinsics_offset, out, surface: Vec::new(), mean_depth, report, truth })
+        let photos = photo_views(&truth)?;
+        Ok(Evaluation {
+            similarity,
+            intrinsics_offset,
+            out,
+            surface: Vec::new(),
+            photos,
+            mean_depth,
+            report,
+            truth,
+        })
     }
 
     /// Scores the scene's direction up, if known.
@@ -198,6 +212,7 @@ impl Evaluation {
         if frame.split == Split::Train {
             self.add_surface(frame, rendered)?;
         }
+        self.add_shown(frame, rendered)?;
         self.report.images.push(image);
         self.report.masks.extend(masks);
         Ok(())
@@ -217,6 +232,29 @@ impl Evaluation {
                 self.surface.push((camera.unproject(pixel, z), frame.camera.unproject(pixel, z_true)));
             }
         }
+        Ok(())
+    }
+
+    /// Scores a frame with true depth over the surfaces that train frames show.
+    fn add_shown(&mut self, frame: &TruthFrame, rendered: &Rendered) -> Result<()> {
+        let Some(depth) = self.truth.depth(frame)? else { return Ok(()) };
+        if self.photos.is_empty() {
+            return Ok(());
+        }
+        let (camera, target) = (&frame.camera, self.truth.image(frame)?);
+        let shown = shown_pixels(camera, &depth, &self.photos);
+        let scale = self.similarity.scale as f32;
+        let depth = rendered.depth.data.iter().map(|z| z * scale).collect();
+        let depth = Image { data: depth, ..rendered.depth };
+        let view = Rendered { rgb: quantised(&rendered.rgb), alpha: rendered.alpha.clone(), depth };
+        let psnr = |image: &RgbImage| metrics::psnr_masked(image, &target, |i| shown[i]);
+        self.report.shown.push(FrameShown {
+            frame: frame.stem.clone(),
+            split: frame.split,
+            psnr: psnr(&view.rgb),
+            psnr_white: psnr(&on_white(&view)),
+            score: shown_score(camera, &view, &shown, &self.photos),
+        });
         Ok(())
     }
 
@@ -303,12 +341,13 @@ impl Evaluation {
     pub fn finish(mut self) -> EvalReport {
         self.report.surface_lengths = length_score(&self.surface, LEAST_LENGTH * self.mean_depth);
         self.report.definitions = DEFINITIONS.map(String::from).to_vec();
-        for split in [Split::Train, Split::Test] {
-            let summary = summarise(&self.report.images, &self.report.masks, split);
+        let has_out = self.truth.frames.iter().any(|f| f.split == Split::Out);
+        for split in [Split::Train, Split::Test].into_iter().chain(has_out.then_some(Split::Out)) {
+            let summary = summarise(&self.report.images, &self.report.masks, &self.report.shown, split);
             self.report.summary.insert(split.name().to_string(), summary);
         }
         if let Some(refined) = &mut self.report.refined {
-            refined.summary = summarise(&refined.images, &refined.masks, Split::Test);
+            refined.summary = summarise(&refined.images, &refined.masks, &[], Split::Test);
         }
         self.report
     }
@@ -352,7 +391,20 @@ fn mean(values: Vec<f64>) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
-fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> SplitSummary {
+/// The train frames that have true depth.
+fn photo_views(truth: &GroundTruth) -> Result<Vec<PhotoView>> {
+    let mut photos = Vec::new();
+    for frame in truth.frames.iter().filter(|f| f.split == Split::Train) {
+        if let Some(depth) = truth.depth(frame)? {
+            photos.push(PhotoView::new(frame.camera.clone(), &truth.image(frame)?, depth));
+        }
+    }
+    Ok(photos)
+}
+
+fn summarise(images: &[ImageScore], masks: &[MaskScore], shown: &[FrameShown], split: Split) -> SplitSummary {
+    let shown: Vec<&FrameShown> = shown.iter().filter(|s| s.split == split).collect();
+    let shown = |value: &dyn Fn(&FrameShown) -> f64| mean(shown.iter().map(|s| value(s)).collect());
     let images: Vec<&ImageScore> = images.iter().filter(|i| i.split == split).collect();
     let masks: Vec<&MaskScore> = masks.iter().filter(|m| m.split == split).collect();
     let mut per_phrase: BTreeMap<String, Vec<f64>> = BTreeMap::new();
@@ -368,6 +420,13 @@ fn summarise(images: &[ImageScore], masks: &[MaskScore], split: Split) -> SplitS
         depth_delta: mean(images.iter().filter_map(|i| i.depth_delta).collect()),
         miou: mean(masks.iter().map(|m| m.iou).collect()),
         localisation: mean(masks.iter().map(|m| f64::from(m.localised)).collect()),
+        psnr_shown: shown(&|s| s.psnr),
+        psnr_shown_white: shown(&|s| s.psnr_white),
+        alpha_below_50: shown(&|s| s.score.alpha_below_50),
+        alpha_below_90: shown(&|s| s.score.alpha_below_90),
+        alpha_below_99: shown(&|s| s.score.alpha_below_99),
+        transparent: shown(&|s| s.score.transparent),
+        confetti: shown(&|s| s.score.confetti),
         iou: per_phrase.into_iter().filter_map(|(k, v)| mean(v).map(|m| (k, m))).collect(),
     }
 }

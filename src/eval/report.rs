@@ -1,10 +1,10 @@
 //! Report of `splatvk eval`.
-use super::{InstanceScore, LengthScore, Split};
+use super::{InstanceScore, LengthScore, ShownScore, Split};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
 /// Definitions of the figures of the report.
-pub(super) const DEFINITIONS: [&str; 11] = [
+pub(super) const DEFINITIONS: [&str; 12] = [
     "poses: after the similarity that maps the scene's cameras of the train frames onto the true ones",
     "relative_poses: over all pairs of train frames, the angle between the relative rotations and between the directions of \
      the baselines; auc_N: area under the share of pairs whose larger angle is below x, x from 0 to N degrees, exact",
@@ -23,7 +23,11 @@ pub(super) const DEFINITIONS: [&str; 11] = [
      the object",
     "instances: things in space that answer a phrase, and the objects that it means; centre_distance: from the middle of what the \
      train frames show of each to that of the nearest thing, in units of the truth",
-    "train: photos that the scene was made from; test: held-out frames",
+    "train: photos that the scene was made from; test: held-out frames; out: held-out frames beside the photos",
+    "shown: pixels whose true surface a train frame shows, by true depth within 1 %; psnr and psnr_white of a frame are over \
+     them, over black and over white. transparent: share of all pixels with alpha < 0.9. confetti: share of all pixels with a \
+     colour that no train frame has near their point: mean, red - green or blue - green of the 8-bit render over alpha is \
+     0.1 outside of the range in a window of 3 % of the width around its place, in every train frame that has that place",
     "refined: held-out frames again, each with the focal length and principal point that the scene found for its own photos \
      (focal_relative and centre_shift against the truth's), from a camera moved until the frozen scene's render is closest to \
      the photo; kept only where psnr_colour_fit rises. Everything outside `refined` is from the cameras as given",
@@ -63,6 +67,23 @@ pub struct ImageScore {
     pub depth_abs_rel: Option<f64>,
     /// Share of pixels whose depth at that scale has a ratio below 1.25.
     pub depth_delta: Option<f64>,
+}
+
+/// Scores of one frame over the surfaces that the photos show.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[non_exhaustive]
+pub struct FrameShown {
+    /// Frame file stem.
+    pub frame: String,
+    /// Role of the frame.
+    pub split: Split,
+    /// dB over black.
+    pub psnr: f64,
+    /// dB over white.
+    pub psnr_white: f64,
+    /// Opacity and foreign colours.
+    #[serde(flatten)]
+    pub score: ShownScore,
 }
 
 /// Score of one phrase in one frame.
@@ -107,6 +128,20 @@ pub struct SplitSummary {
     pub miou: Option<f64>,
     /// Share of (object, view) pairs whose most relevant pixel lies on the object.
     pub localisation: Option<f64>,
+    /// Mean PSNR over what the photos show, dB; this and the next six `None` without true depth.
+    pub psnr_shown: Option<f64>,
+    /// Mean PSNR over what the photos show, over white, dB.
+    pub psnr_shown_white: Option<f64>,
+    /// Mean share of what the photos show with alpha < 0.5.
+    pub alpha_below_50: Option<f64>,
+    /// Mean share of what the photos show with alpha < 0.9.
+    pub alpha_below_90: Option<f64>,
+    /// Mean share of what the photos show with alpha < 0.99.
+    pub alpha_below_99: Option<f64>,
+    /// Mean share of all pixels with alpha < 0.9.
+    pub transparent: Option<f64>,
+    /// Mean share of pixels with a colour that no photo has near their point.
+    pub confetti: Option<f64>,
     /// Mean IoU per phrase.
     pub iou: BTreeMap<String, f64>,
 }
@@ -187,11 +222,13 @@ pub struct EvalReport {
     pub camera_lengths: Option<LengthScore>,
     /// Scores per rendered frame.
     pub images: Vec<ImageScore>,
+    /// Scores per frame with true depth over what the photos show.
+    pub shown: Vec<FrameShown>,
     /// Scores per object and frame, without background labels.
     pub masks: Vec<MaskScore>,
     /// Instances per phrase.
     pub instances: Vec<InstanceScore>,
-    /// Means per split, `train` and `test`.
+    /// Means per split: `train`, `test`, and `out` where the truth has such frames.
     pub summary: BTreeMap<String, SplitSummary>,
     /// Held-out frames from refined cameras, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]

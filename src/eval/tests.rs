@@ -68,6 +68,21 @@ fn evaluation_scores_perfect_scene_perfectly() {
     assert!(train.depth_median_relative.unwrap() < 1e-5);
     assert!(train.depth_abs_rel.unwrap() < 1e-4 && train.depth_delta.unwrap() > 0.999);
     assert!(train.psnr_colour_fit.unwrap() >= train.psnr.unwrap() - 1e-6);
+    let frames: Vec<&str> = report.shown.iter().map(|s| s.frame.as_str()).collect();
+    assert_eq!(frames, ["train_03", "test_05", "out_13"]);
+    for FrameShown { psnr, psnr_white, score, .. } in &report.shown {
+        assert!(*psnr > 60.0 && psnr == psnr_white, "{psnr} {psnr_white}");
+        assert!(
+            score.alpha_below_99 == 0.0 && score.transparent == 0.0 && score.confetti < 2e-3,
+            "{score:?}"
+        );
+    }
+    let shares: Vec<f64> = report.shown.iter().map(|s| s.score.shown).collect();
+    assert!(
+        shares[0] > 0.999 && (0.8..1.0).contains(&shares[1]) && (0.5..0.9).contains(&shares[2]),
+        "{shares:?}"
+    );
+    assert!(report.summary["out"].psnr_shown.unwrap() > 60.0);
     assert_eq!(report.relative_poses.pairs.len(), 6);
     assert!(report.relative_poses.auc_3.unwrap() > 0.999 && report.refined.is_none());
     let mask = image::open(dir.path().join("masks/7/test_05.png")).unwrap().to_luma8();

@@ -41,18 +41,42 @@ impl EvalReport {
             "", "PSNR", "+colours", "SSIM", "depth med", "AbsRel", "d<1.25", "mIoU", "localised"
         );
         let refined = self.refined.as_ref().map(|r| ("refined", &r.summary));
-        let rows = ["train", "test"].into_iter().filter_map(|k| Some((k, self.summary.get(k)?)));
+        let splits = ["train", "test", "out"];
+        let rows = splits.into_iter().filter_map(|k| Some((k, self.summary.get(k)?)));
         rows.chain(refined).for_each(|(name, summary)| row(&mut out, name, summary));
         if let Some(refined) = &self.refined {
             let kept = refined.views.iter().filter(|v| v.kept).count();
             let _ = writeln!(out, "refined: {kept} of {} held-out cameras moved", refined.views.len());
         }
+        let rows = splits.into_iter().filter_map(|k| Some((k, self.summary.get(k)?)));
+        let mut rows = rows.filter(|(_, s)| s.psnr_shown.is_some()).peekable();
+        if rows.peek().is_some() {
+            let _ = writeln!(
+                out,
+                "{:<9}{:>8}{:>10}{:>12}{:>12}{:>13}{:>10}",
+                "shown", "PSNR", "on white", "alpha<0.9", "alpha<0.5", "all, <0.9", "confetti"
+            );
+            rows.for_each(|(name, summary)| shown_row(&mut out, name, summary));
+        }
         out
     }
 }
 
+/// Means over what the photos show.
+fn shown_row(out: &mut String, name: &str, s: &SplitSummary) {
+    let _ = writeln!(
+        out,
+        "{name:<9}{:>8}{:>10}{:>12}{:>12}{:>13}{:>10}",
+        number(s.psnr_shown, 2),
+        number(s.psnr_shown_white, 2),
+        percent(s.alpha_below_90),
+        percent(s.alpha_below_50),
+        percent(s.transparent),
+        percent(s.confetti),
+    );
+}
+
 fn row(out: &mut String, name: &str, s: &SplitSummary) {
-    let number = |v: Option<f64>, digits: usize| v.map_or_else(|| "-".into(), |v| format!("{v:.digits$}"));
     let _ = writeln!(
         out,
         "{name:<9}{:>8}{:>10}{:>7}{:>11}{:>9}{:>9}{:>8}{:>11}",
@@ -65,6 +89,10 @@ fn row(out: &mut String, name: &str, s: &SplitSummary) {
         number(s.miou, 3),
         number(s.localisation, 3),
     );
+}
+
+fn number(v: Option<f64>, digits: usize) -> String {
+    v.map_or_else(|| "-".into(), |v| format!("{v:.digits$}"))
 }
 
 fn percent(v: Option<f64>) -> String {

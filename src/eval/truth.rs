@@ -18,6 +18,8 @@ pub enum Split {
     Train,
     /// Held-out photos.
     Test,
+    /// Held-out photos beside the others.
+    Out,
 }
 
 impl Split {
@@ -26,6 +28,7 @@ impl Split {
         match self {
             Split::Train => "train",
             Split::Test => "test",
+            Split::Out => "out",
         }
     }
 }
@@ -37,7 +40,7 @@ pub struct TruthFrame {
     pub file: String,
     /// File name without extension.
     pub stem: String,
-    /// Train or test.
+    /// Role of the frame.
     pub split: Split,
     /// Intrinsics and pose in the true world.
     pub camera: Camera,

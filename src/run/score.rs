@@ -75,7 +75,8 @@ pub fn score_field(
     Ok(evaluation.finish())
 }
 
-fn rendered(view: &DecodedFrame) -> Rendered {
+/// The images of a frame that are scored.
+pub(super) fn rendered(view: &DecodedFrame) -> Rendered {
     let frame = &view.rendered;
     Rendered { rgb: frame.rgb.clone(), alpha: frame.alpha.clone(), depth: frame.depth.clone() }
 }

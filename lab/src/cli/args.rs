@@ -217,6 +217,9 @@ pub struct GenerateArgs {
     /// Held-out views
     #[arg(long, default_value_t = 6, value_name = "N", value_parser = whole::<usize>(0..))]
     pub held_out: usize,
+    /// Also eight held-out views beside the photos, as those of `splatvk render --path beyond`
+    #[arg(long)]
+    pub beyond: bool,
     /// Picture size, pixels
     #[arg(long, default_value = "640x480", value_name = "WxH")]
     pub size: String,

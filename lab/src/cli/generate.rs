@@ -52,6 +52,7 @@ fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
         seed: args.seed,
         views: args.views,
         held_out: args.held_out,
+        beyond: args.beyond,
         size,
         objects: args.objects,
         baseline: args.baseline,

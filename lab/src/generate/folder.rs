@@ -101,10 +101,13 @@ fn write_views(
     let quality = spec.effects.jpeg.unwrap_or(QUALITY);
     // Where photos have effects of a phone camera, held-out views are free of noise.
     let held_out_noise = if spec.effects.any() { 0.0 } else { spec.photo_noise };
-    progress.begin("render", (scene.photo_effects.len() + scene.test.len()) as u64);
+    let held_out = scene.test.iter().map(|c| (c, Split::Test));
+    let held_out: Vec<(&Camera, Split)> = held_out.chain(scene.out.iter().map(|c| (c, Split::Out))).collect();
+    let total = scene.photo_effects.len() + held_out.len();
+    progress.begin("render", total as u64);
     let shown = Photos::new(scene, spec)?;
     let mut frames = Vec::new();
-    for i in 0..scene.photo_effects.len() + scene.test.len() {
+    for i in 0..total {
         progress.check()?;
         let seed = spec.seed.wrapping_add(i as u64);
         frames.push(match scene.photo_effects.get(i) {
@@ -121,11 +124,10 @@ fn write_views(
                 frame
             }
             None => {
-                let camera = &scene.test[i - scene.photo_effects.len()];
+                let (camera, split) = held_out[i - scene.photo_effects.len()];
                 let seen = render::render(scene, camera, held_out_noise, seed);
-                let file =
-                    write_view(folder, camera, Split::Test, &seen, Jpeg { quality: QUALITY, exif: None })?;
-                frame_json(camera, Split::Test, &file)
+                let file = write_view(folder, camera, split, &seen, Jpeg { quality: QUALITY, exif: None })?;
+                frame_json(camera, split, &file)
             }
         });
         progress.step(i as u64 + 1, "");
@@ -182,13 +184,22 @@ mod tests {
     #[test]
     fn generate_reads_back_as_ground_truth() {
         let dir = tempfile::tempdir().unwrap();
-        let spec = SceneSpec { seed: 1000, size: (160, 120), views: 3, held_out: 2, ..SceneSpec::default() };
+        let spec = SceneSpec {
+            seed: 1000,
+            size: (160, 120),
+            views: 3,
+            held_out: 2,
+            beyond: true,
+            ..SceneSpec::default()
+        };
         generate(dir.path(), &spec, &InjectedErrors::default_rates(1000), &Silent).unwrap();
         let truth = GroundTruth::read(dir.path()).unwrap();
         let made = build_scene(&spec).unwrap();
-        assert_eq!((truth.frames.len(), truth.labels.len()), (5, made.objects.len()));
+        assert_eq!((truth.frames.len(), truth.labels.len()), (13, made.objects.len()));
         assert_eq!(truth.up, Some(glam::DVec3::Z));
-        for (frame, camera) in truth.frames.iter().zip(made.train.iter().chain(&made.test)) {
+        assert_eq!(truth.frames.iter().filter(|f| f.split == Split::Out).count(), 8);
+        let cameras = made.train.iter().chain(&made.test).chain(&made.out);
+        for (frame, camera) in truth.frames.iter().zip(cameras) {
             assert_eq!(frame.stem, camera.name);
             assert!((frame.camera.pose.centre() - camera.pose.centre()).length() < 1e-12);
             let seen = render::render(&made, camera, 0.0, 0);

@@ -273,6 +273,7 @@ mod tests {
                 train: vec![],
                 photo_effects: vec![],
                 test: vec![],
+                out: vec![],
                 noisy: vec![],
             },
             places,

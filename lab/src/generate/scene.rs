@@ -9,7 +9,7 @@ use crate::{Error, Result};
 use glam::{DMat3, DVec2, DVec3};
 use serde::Serialize;
 use splatvk::math::Random;
-use splatvk::scene::{Camera, Pose};
+use splatvk::scene::{Camera, CameraOrbit, Pose};
 
 /// Contents and difficulties of a synthetic scene.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -20,6 +20,8 @@ pub struct SceneSpec {
     pub views: usize,
     /// Held-out views.
     pub held_out: usize,
+    /// Whether there are also held-out views beside the photos ([`CameraOrbit::beyond`]).
+    pub beyond: bool,
     /// Width and height, pixels.
     pub size: (u32, u32),
     /// Objects on the table, 1 to 12.
@@ -65,6 +67,7 @@ impl Default for SceneSpec {
             seed: 0,
             views: 4,
             held_out: 6,
+            beyond: false,
             size: (640, 480),
             objects: 8,
             baseline: 20.0,
@@ -100,6 +103,8 @@ pub struct SyntheticScene {
     pub photo_effects: Vec<PhotoEffects>,
     /// True cameras of the held-out views.
     pub test: Vec<Camera>,
+    /// True cameras of the views beside the photos.
+    pub out: Vec<Camera>,
     /// Cameras of the photos with pose errors, as a starting point.
     pub noisy: Vec<Camera>,
 }
@@ -131,8 +136,8 @@ impl SceneSpec {
             }
             k if !(1.0..=80.0).contains(&k.baseline) => "--baseline: 1 to 80 degrees",
             k if !(0.25..=4.0).contains(&k.zoom) => "--zoom: 0.25 to 4",
-            k if k.flat.is_some() && (k.outdoor || k.similar + k.thin > 0) => {
-                "--flat holds sheets alone: without --outdoor, --similar and --thin"
+            k if k.flat.is_some() && (k.outdoor || k.beyond || k.similar + k.thin > 0) => {
+                "--flat holds sheets alone: without --outdoor, --beyond, --similar and --thin"
             }
             k if [k.occlusion, k.texture, k.gloss].iter().any(|v| !(0.0..=1.0).contains(v)) => {
                 "--occlusion, --texture and --gloss: 0 to 1"
@@ -191,6 +196,7 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
         Camera { fx, fy, ..made }
     });
     let test: Vec<Camera> = test.collect();
+    let out = if spec.beyond { beside(spec, &train) } else { Vec::new() };
     let (sigma, unit) = (spec.pose_noise.to_radians(), spec.unit());
     let noisy = train.iter().map(|c| {
         let mut draw = || DVec3::new(random.normal(), random.normal(), random.normal()) * sigma;
@@ -199,7 +205,26 @@ pub fn build_scene(spec: &SceneSpec) -> Result<SyntheticScene> {
         Camera { pose: error.compose(&c.pose), ..c.clone() }
     });
     let noisy = noisy.collect();
-    Ok(SyntheticScene { objects, gloss: spec.gloss, sky, train, photo_effects, test, noisy })
+    Ok(SyntheticScene { objects, gloss: spec.gloss, sky, train, photo_effects, test, out, noisy })
+}
+
+/// Views beside the photos, with the frame of held-out views.
+fn beside(spec: &SceneSpec, train: &[Camera]) -> Vec<Camera> {
+    let views = CameraOrbit::new(train, target(spec), DVec3::Z).beyond().into_iter().enumerate();
+    let first = spec.views + spec.held_out;
+    let (fx, fy) = train.first().map_or((1.0, 1.0), |c| (c.fx, c.fy));
+    views
+        .map(|(i, view)| {
+            let name = format!("out_{:02}_{}", first + i, view.name);
+            Camera { fx, fy, ..pinhole(spec, &name, view.pose) }
+        })
+        .collect()
+}
+
+/// The point that the cameras look at.
+fn target(spec: &SceneSpec) -> DVec3 {
+    let height = if spec.outdoor { 0.12 } else { 0.04 };
+    DVec3::new(0.0, 0.0, height) * spec.unit()
 }
 
 /// Table, wall and carpet of an indoor scene, labels 1 to 3.
@@ -300,11 +325,8 @@ fn solid(noun: &str, unit: f64, random: &mut Random) -> (f64, Box<dyn Fn(DVec2) 
 /// A camera on a sphere around the middle of the scene, which it looks at; angles in degrees.
 /// `elevation` is that of a table scene; outdoors it is scaled to [`outdoor::ELEVATION`].
 fn camera(spec: &SceneSpec, name: &str, azimuth: f64, elevation: f64) -> Camera {
-    let (target, elevation) = match spec.outdoor {
-        true => (DVec3::new(0.0, 0.0, 0.12), outdoor::ELEVATION * elevation / 32.0),
-        false => (DVec3::new(0.0, 0.0, 0.04), elevation),
-    };
-    let (a, e, target) = (azimuth.to_radians(), elevation.to_radians(), target * spec.unit());
+    let elevation = if spec.outdoor { outdoor::ELEVATION * elevation / 32.0 } else { elevation };
+    let (a, e, target) = (azimuth.to_radians(), elevation.to_radians(), target(spec));
     let centre = target + 0.95 * spec.unit() * DVec3::new(a.sin() * e.cos(), -a.cos() * e.cos(), e.sin());
     let z = (target - centre).normalize();
     let x = z.cross(DVec3::Z).normalize();

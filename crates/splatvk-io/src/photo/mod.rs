@@ -28,6 +28,7 @@ mod tiff;
 mod turn;
 mod twins;
 mod video;
+mod video_writer;
 mod xmp;
 
 pub use border::PlainBorder;
@@ -49,6 +50,7 @@ pub use straighten::Straightening;
 pub use superpixels::superpixels;
 pub use support::Support;
 pub use turn::Turn;
+pub use video_writer::VideoWriter;
 
 use crate::progress::Progress;
 use crate::scene::{Outside, RgbImage};

@@ -165,7 +165,7 @@ fn reader(program: &str) -> Command {
 }
 
 /// The path as a URL: no file name can be read as an option or another protocol.
-fn file(path: &Path) -> OsString {
+pub(super) fn file(path: &Path) -> OsString {
     let mut address = OsString::from("file:");
     address.push(path);
     address

@@ -5,6 +5,7 @@
 //! y, z)`, depth = camera z, images row-major RGB in [0, 1] (sRGB values as they are).
 mod affine;
 mod camera;
+mod camera_path;
 pub mod code_mix;
 mod coverage;
 mod given;
@@ -26,6 +27,7 @@ mod world;
 
 pub use affine::Affine;
 pub use camera::{Camera, MAX_PIXELS, MAX_SIDE, Pose};
+pub use camera_path::CameraOrbit;
 pub use code_mix::CodeMix;
 pub use coverage::{Coverage, Outside};
 pub use given::GivenCamera;
