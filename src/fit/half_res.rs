@@ -14,16 +14,18 @@ pub(crate) struct Photos<'a> {
     pub(crate) coverage: &'a [Option<Coverage>],
 }
 
-/// [`Photos`] at half the resolution.
-pub(super) struct HalfResPhotos {
-    images: Vec<RgbImage>,
-    cameras: Vec<Camera>,
-    depths: Option<Vec<DepthMap>>,
-    coverage: Vec<Option<Coverage>>,
+/// [`Photos`] that own their data.
+#[derive(Default)]
+pub(super) struct OwnedPhotos {
+    pub(super) images: Vec<RgbImage>,
+    pub(super) cameras: Vec<Camera>,
+    pub(super) depths: Option<Vec<DepthMap>>,
+    pub(super) coverage: Vec<Option<Coverage>>,
 }
 
-impl HalfResPhotos {
-    pub(super) fn of(photos: &Photos) -> HalfResPhotos {
+impl OwnedPhotos {
+    /// Photos at half their resolution.
+    pub(super) fn at_half_res(photos: &Photos) -> OwnedPhotos {
         let Photos { images, cameras, depths, coverage } = *photos;
         let image = |i: &RgbImage| i.resized_by_area(half(i.width), half(i.height));
         let camera = |c: &Camera| c.resized(half(c.width as usize) as u32, half(c.height as usize) as u32);
@@ -32,7 +34,7 @@ impl HalfResPhotos {
             ..c.clone()
         };
         let depth = |d: &DepthMap| DepthMap { depth: sampled(&d.depth), confidence: sampled(&d.confidence) };
-        HalfResPhotos {
+        OwnedPhotos {
             images: images.iter().map(image).collect(),
             cameras: cameras.iter().map(camera).collect(),
             depths: depths.map(|all| all.iter().map(depth).collect()),

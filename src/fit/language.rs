@@ -3,9 +3,11 @@
 //! features.
 use super::half_res::Photos;
 use super::lift::{CodeTargets, Lifting};
+use super::losses::Losses;
 use super::model::{Model, not_finite};
 use super::options::{LanguageOptions, Start};
 use super::scale::SceneScale;
+use super::schedule::ViewOrder;
 use super::training::{self, StepReport, Trainer, Training};
 use super::views::Views;
 use crate::gpu::{self, Buffer, Device, Recorder};
@@ -19,8 +21,6 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
-/// Weights of L1 and D-SSIM in L_img, as in the colour stage (the paper).
-const IMAGE_WEIGHTS: [f64; 2] = [0.8, 0.2];
 /// Slot of the language loss in the loss sums; Σ|x−y| and ΣSSIM precede it.
 const LANGUAGE_SUM: u32 = 2;
 /// Least gain of decode accuracy over two measurements; a smaller gain ends the training
@@ -153,7 +153,7 @@ pub(crate) struct StageState {
 impl<'a> Run<'a> {
     pub(crate) fn new(
         device: &Device,
-        Photos { images, cameras, coverage, .. }: Photos,
+        photos: Photos,
         splats: &Splats,
         levels: &[(usize, &'a LevelField)],
         options: &'a LanguageOptions,
@@ -162,10 +162,11 @@ impl<'a> Run<'a> {
         let fields: Vec<&LevelField> = levels.iter().map(|l| l.1).collect();
         let width = fields[0].codebook.code_dim;
         let channels = width * levels.len();
+        let Photos { images, cameras, .. } = photos;
         let scale = SceneScale::measure(cameras, &splats.means);
         let model = Model::new(device, splats, channels)?;
         let (capacity, near) = (splats.len(), scale.near());
-        let mut views = Views::new(device, images, cameras, None, coverage, capacity, channels, near)?;
+        let mut views = Views::new(device, photos, (&options.losses, 0.0), capacity, channels, near)?;
         let targets = CodeTargets::new(device, &fields, images, &views, 1.0 - options.image_weight)?;
         let raster = RasterOptions {
             sh_degree: splats.sh_degree,
@@ -192,8 +193,9 @@ impl<'a> Run<'a> {
             .iter()
             .map(|s| device.buffer::<f32>("language loss", s.raster.frame().bands.pixels()))
             .collect::<gpu::Result<_>>()?;
+        let order = ViewOrder::new(cameras.len(), 0, options.seed);
         Ok(Run {
-            trainer: Trainer::new(device, raster, model, views, cameras, options.seed),
+            trainer: Trainer::new(device, raster, model, views, cameras.to_vec(), order),
             options,
             levels: levels.to_vec(),
             width,
@@ -295,7 +297,8 @@ impl Training for Run<'_> {
         let frame = stage.raster.frame();
         let mut rec = Recorder::new(device, "language step");
         stage.raster.record_projection(&mut rec, &model.values, raster);
-        let weights = IMAGE_WEIGHTS.map(|w| w * self.options.image_weight);
+        let Losses { l1, dssim, .. } = self.options.losses;
+        let weights = [l1, dssim].map(|w| w * self.options.image_weight);
         let loss = &self.losses[item.stage];
         for band in frame.bands.iter() {
             stage.raster.record_band(&mut rec, &model.values, &band);
@@ -312,8 +315,8 @@ impl Training for Run<'_> {
                     weights,
                     sums,
                 );
-                if let Some(alpha) = &item.alpha {
-                    let weight = weights[0] / f64::from(frame.width * frame.height);
+                if let Some((alpha, weight)) = &item.alpha {
+                    let weight = self.options.image_weight * weight;
                     regularise::record_depth(&mut rec, frame, None, 0.0);
                     regularise::record_alpha(&mut rec, frame, &alpha[band.index], weight);
                 }

@@ -5,7 +5,7 @@ use crate::gpu::Recorder;
 use crate::pass::bands::Band;
 use crate::pass::regularise::{self, RatioPenalty};
 use crate::pass::ssim_l1::ImageLoss;
-use crate::scene::DepthMap;
+use crate::scene::{Coverage, Outside};
 
 /// Ratio of the axes of a splat up to which it is no needle.
 const RATIO_LIMIT: f32 = 8.0;
@@ -21,20 +21,38 @@ pub struct Losses {
     pub depth: Option<f64>,
     /// Weight of `mean max(0, s_max/s_min − 8)`, against needles.
     pub needles: Option<f64>,
+    /// Weight of mean |1 − A| over the used pixels of photos without transparency: every pixel
+    /// shows something, also where it is as black as the background of the render.
+    pub opacity: Option<f64>,
 }
 
 impl Losses {
     /// The photos alone, with the weights of 3DGS (Kerbl et al. 2023).
-    pub const PHOTOS: Losses = Losses { l1: 0.8, dssim: 0.2, depth: None, needles: None };
+    pub const PHOTOS: Losses = Losses { l1: 0.8, dssim: 0.2, depth: None, needles: None, opacity: None };
 
     /// The photos' part of the objective.
     pub(super) fn photos(&self, loss: &ImageLoss) -> f64 {
         loss.total(self.l1, self.dssim)
     }
 
-    /// The depth maps, if the objective uses them.
-    pub(super) fn depth_inputs<'d>(&self, depths: Option<&'d [DepthMap]>) -> Option<&'d [DepthMap]> {
-        depths.filter(|_| self.depth.is_some())
+    /// Warped photos: their edges are less sharp than those of photos, and their depth is the
+    /// depth that warps them.
+    pub(super) const VIRTUAL: Losses =
+        Losses { l1: 0.4, dssim: 0.0, depth: Some(0.02), needles: None, opacity: Some(0.05) };
+
+    /// Alpha that the objective asks of the pixels of a photo, −1 where it asks for none, and its
+    /// weight per pixel.
+    pub(super) fn wanted_alpha(&self, pixels: usize, coverage: Option<&Coverage>) -> Option<(Vec<f32>, f64)> {
+        let (alpha, weight) = match (coverage, self.opacity) {
+            // Weighted as one more channel of the L1 loss.
+            (Some(c), _) if c.outside == Outside::Empty => (c.share.data.clone(), self.l1),
+            (Some(c), Some(weight)) => {
+                (c.weights().data.iter().map(|w| if *w > 0.0 { 1.0 } else { -1.0 }).collect(), weight)
+            }
+            (None, Some(weight)) => (vec![1.0; pixels], weight),
+            (_, None) => return None,
+        };
+        Some((alpha, weight / pixels as f64))
     }
 
     /// Records the gradients by the rendered planes of a band.
@@ -57,10 +75,8 @@ impl Losses {
             _ => (None, 0.0),
         };
         regularise::record_depth(rec, frame, reference, weight);
-        if let Some(alpha) = &item.alpha {
-            // Weighted as one more channel of the L1 loss.
-            let weight = self.l1 / f64::from(frame.width * frame.height);
-            regularise::record_alpha(rec, frame, &alpha[band.index], weight);
+        if let Some((alpha, weight)) = &item.alpha {
+            regularise::record_alpha(rec, frame, &alpha[band.index], *weight);
         }
     }
 

@@ -18,6 +18,7 @@ mod training;
 mod unseen;
 mod view_dependent;
 mod views;
+mod virtual_views;
 
 pub use crate::preset::Preset;
 pub use added::new_surface;

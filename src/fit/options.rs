@@ -47,6 +47,9 @@ impl Rates {
     };
 }
 
+/// Weight of the opacity loss.
+const OPACITY: Option<f64> = Some(0.1);
+
 /// Options of [`super::train_rgb`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct RgbOptions {
@@ -65,6 +68,9 @@ pub struct RgbOptions {
     pub half_res: f64,
     /// Terms of the objective.
     pub losses: Losses,
+    /// Number of virtual views, photos warped by their depth, in a run that starts at half
+    /// resolution.
+    pub virtual_views: usize,
     /// Least confidence of stereo depth that is used.
     pub min_confidence: f32,
     /// Whether splats are clamped: in every photo behind the least depth of that photo, and no
@@ -132,7 +138,7 @@ impl RgbOptions {
     /// a few photos: 0.9 dB more on them, 0.3 less on views between them
     /// (docs/internals/experiments.md#how-long-to-train).
     fn short() -> Self {
-        RgbOptions { half_res: 0.6, ..Self::scaled(300, 2.0) }
+        RgbOptions { half_res: 0.6, ..Self::scaled(400, 2.0) }
     }
 
     /// Options of the draft preset, with fewer splats: on breakfast two fifths less time and 0.4 dB
@@ -161,8 +167,9 @@ impl RgbOptions {
                 sh_dc: 2.5e-3 * speed,
                 sh_rest: 2.5e-3 / 20.0 * speed,
             },
-            losses: Losses { depth: Some(0.02), needles: Some(1e-3), ..Losses::PHOTOS },
+            losses: Losses { depth: Some(0.02), needles: Some(1e-3), opacity: OPACITY, ..Losses::PHOTOS },
             min_confidence: 0.5,
+            virtual_views: 12,
             bounded: true,
             poses: Some(PoseOptions {
                 start: (iterations / 10).min(100),
@@ -193,6 +200,7 @@ impl RgbOptions {
             },
             half_res: 0.0,
             losses: Losses::PHOTOS,
+            virtual_views: 0,
             min_confidence: 0.5,
             bounded: false,
             prune_opacity: 0.005,
@@ -223,6 +231,8 @@ pub struct LanguageOptions {
     pub seed: u64,
     /// λ2 of `L = λ2·L_img + (1−λ2)·L_sem`.
     pub image_weight: f64,
+    /// Terms of L_img; depth and needles are not used here.
+    pub losses: Losses,
     /// Learning rates of everything but the features (reduced,
     /// docs/internals/method.md#language-rates).
     pub rates: Rates,
@@ -258,6 +268,7 @@ impl LanguageOptions {
             iterations,
             seed: 0,
             image_weight: 0.3,
+            losses: if paper { Losses::PHOTOS } else { Losses { opacity: OPACITY, ..Losses::PHOTOS } },
             rates: Rates {
                 means: Exponential { start: 3e-5, end: 3e-7, steps: 30_000 },
                 log_scales: 1e-3,

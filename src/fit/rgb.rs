@@ -1,16 +1,19 @@
 //! RGB stage: fits splats, initialised from points, to the photos and refines the cameras
 //! (docs/internals/method.md#splats).
 use super::bounds::Bounds;
-use super::half_res::{HalfResPhotos, Photos};
+use super::half_res::{OwnedPhotos, Photos};
 use super::init::splats_from_points;
+use super::losses::Losses;
 use super::model::Model;
 use super::options::RgbOptions;
 use super::pose::PoseAdam;
 use super::scale::SceneScale;
+use super::schedule::ViewOrder;
 use super::sh_degree::ViewDependence;
 use super::training::{self, StepReport, Trainer, Training};
 use super::unseen::unseen_splats;
 use super::views::Views;
+use super::virtual_views::virtual_views;
 use crate::gpu::{Device, Recorder};
 use crate::pass::metrics::psnr_masked;
 use crate::pass::options::{FeatureMode, RasterOptions};
@@ -184,12 +187,14 @@ pub(crate) struct Run<'a> {
     photos: Photos<'a>,
     bounds: Option<Bounds>,
     /// Photos of the first steps.
-    half_res: Option<HalfResPhotos>,
+    half_res: Option<OwnedPhotos>,
+    /// Views that follow the photos.
+    virtual_views: OwnedPhotos,
     poses: Vec<PoseAdam>,
     /// Losses since the last report.
     recent: Vec<ImageLoss>,
-    /// The view of the last step.
-    last: usize,
+    /// The photo of the last step on one, and whether a step on a virtual view followed.
+    last: (usize, bool),
     /// Last measured PSNR per view, dB.
     psnr: Vec<Option<f64>>,
     curve: Vec<CurvePoint>,
@@ -200,7 +205,7 @@ pub(crate) struct Run<'a> {
 pub(crate) struct StageState {
     poses: Vec<PoseAdam>,
     recent: Vec<ImageLoss>,
-    last: usize,
+    last: (usize, bool),
     psnr: Vec<Option<f64>>,
     curve: Vec<CurvePoint>,
 }
@@ -213,18 +218,30 @@ impl<'a> Run<'a> {
         scale: SceneScale,
         options: &'a RgbOptions,
     ) -> Result<Self> {
-        let half_res = (half_res_steps(options) > 0).then(|| HalfResPhotos::of(&photos));
-        let first = half_res.as_ref().map_or(photos, HalfResPhotos::photos);
+        let half_res = (half_res_steps(options) > 0).then(|| OwnedPhotos::at_half_res(&photos));
+        let first = half_res.as_ref().map_or(photos, OwnedPhotos::photos);
+        let virtual_views = match &half_res {
+            Some(half) if !photos.show_emptiness() => {
+                let (count, confidence) = (options.virtual_views, options.min_confidence);
+                virtual_views(&half.photos(), count, confidence, options.seed)
+            }
+            _ => OwnedPhotos::default(),
+        };
         let raster = RasterOptions {
             sh_degree: start.sh_degree,
             feature_mode: FeatureMode::Linear,
             features_move_geometry: true,
         };
-        let depths = options.losses.depth_inputs(first.depths).map(|d| (d, options.min_confidence));
-        let Photos { images, cameras, coverage, .. } = first;
-        let views = Views::new(device, images, cameras, depths, coverage, start.len(), 0, scale.near())?;
+        let losses = (&options.losses, options.min_confidence);
+        let mut views = Views::new(device, first, losses, start.len(), 0, scale.near())?;
+        if !virtual_views.images.is_empty() {
+            let losses = (&Losses::VIRTUAL, options.min_confidence);
+            views.add(device, virtual_views.photos(), losses, start.len(), 0)?;
+        }
         let model = Model::new(device, start, 0)?;
-        let trainer = Trainer::new(device, raster, model, views, first.cameras, options.seed);
+        let order = ViewOrder::new(photos.cameras.len(), virtual_views.cameras.len(), options.seed);
+        let cameras = [first.cameras, &virtual_views.cameras].concat();
+        let trainer = Trainer::new(device, raster, model, views, cameras, order);
         Ok(Run {
             trainer,
             options,
@@ -232,9 +249,10 @@ impl<'a> Run<'a> {
             photos,
             bounds: options.bounded.then(|| Bounds::new(photos.cameras, &start.means)),
             half_res,
+            virtual_views,
             poses: vec![PoseAdam::default(); photos.cameras.len()],
             recent: Vec::new(),
-            last: 0,
+            last: (0, true),
             psnr: vec![None; photos.cameras.len()],
             curve: Vec::new(),
         })
@@ -245,15 +263,24 @@ impl<'a> Run<'a> {
         if self.half_res.take().is_none() {
             return Ok(());
         }
-        let (t, Photos { images, cameras, depths, coverage }) = (&mut self.trainer, self.photos);
-        let depths = self.options.losses.depth_inputs(depths).map(|d| (d, self.options.min_confidence));
-        let near = self.scale.near();
-        t.views = Views::new(&t.device, images, cameras, depths, coverage, t.model.count(), 0, near)?;
-        for (own, camera) in t.cameras.iter_mut().zip(cameras) {
+        let t = &mut self.trainer;
+        let losses = (&self.options.losses, self.options.min_confidence);
+        let count = t.model.count();
+        t.views = Views::new(&t.device, self.photos, losses, count, 0, self.scale.near())?;
+        if !self.virtual_views.images.is_empty() {
+            let losses = (&Losses::VIRTUAL, self.options.min_confidence);
+            t.views.add(&t.device, self.virtual_views.photos(), losses, count, 0)?;
+        }
+        for (own, camera) in t.cameras.iter_mut().zip(self.photos.cameras) {
             *own = Camera { pose: own.pose, ..camera.clone() };
         }
         t.forget_recordings();
         Ok(())
+    }
+
+    /// The terms of the objective for a view.
+    fn losses(&self, view: usize) -> &Losses {
+        if view < self.photos.cameras.len() { &self.options.losses } else { &Losses::VIRTUAL }
     }
 
     /// Refines a pose; camera 0 stays, because it defines the world frame.
@@ -273,12 +300,15 @@ impl<'a> Run<'a> {
     fn measure(&mut self, step: usize) -> Result<CurvePoint> {
         let t = &mut self.trainer;
         t.model.check(step)?;
-        let rendered = match t.views.last_render(self.last)? {
+        let (photo, is_old) = self.last;
+        // A virtual view of the same size overwrites the render.
+        let rendered = if is_old { None } else { t.views.last_render(photo)? };
+        let rendered = match rendered {
             Some(rendered) => rendered,
-            None => t.views.render(self.last, &t.cameras[self.last], &t.model, &t.raster)?,
+            None => t.views.render(photo, &t.cameras[photo], &t.model, &t.raster)?,
         };
-        let photos = self.half_res.as_ref().map_or(self.photos, HalfResPhotos::photos);
-        self.psnr[self.last] = Some(photos.psnr(self.last, &rendered));
+        let photos = self.half_res.as_ref().map_or(self.photos, OwnedPhotos::photos);
+        self.psnr[photo] = Some(photos.psnr(photo, &rendered));
         let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
         let n = self.recent.len().max(1) as f64;
         let total = |l: &ImageLoss| self.options.losses.photos(l);
@@ -346,7 +376,7 @@ impl<'a> Run<'a> {
         let before = score(initial)?;
         let sum = |v: &[f64]| v.iter().sum::<f64>();
         if sum(&refined) > sum(&before) {
-            Ok((splats, t.cameras.clone(), refined, true))
+            Ok((splats, t.cameras[..initial.len()].to_vec(), refined, true))
         } else {
             Ok((splats, initial.to_vec(), before, false))
         }
@@ -378,7 +408,7 @@ impl Training for Run<'_> {
         stage.raster.record_projection(&mut rec, &model.values, raster);
         for band in frame.bands.iter() {
             stage.raster.record_band(&mut rec, &model.values, &band);
-            self.options.losses.record_image(&mut rec, stage, item, &band);
+            self.losses(view).record_image(&mut rec, stage, item, &band);
             stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
         }
         let needles = self.options.losses.ratio_penalty(model.count());
@@ -392,7 +422,11 @@ impl Training for Run<'_> {
     }
 
     fn read_back(&mut self, view: usize, iteration: usize) -> Result<()> {
-        self.last = view;
+        if view >= self.photos.cameras.len() {
+            self.last.1 = true;
+            return Ok(());
+        }
+        self.last = (view, false);
         let stage = self.trainer.views.stage(view);
         let [l1, ssim, ..] = stage.total()?;
         self.recent.push(stage.loss.loss([l1, ssim], self.trainer.views.list[view].covered));

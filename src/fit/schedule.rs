@@ -30,27 +30,43 @@ impl Exponential {
     }
 }
 
-/// Endless view indices, drawn without replacement within each round.
+/// Endless view indices, drawn without replacement within each round; virtual views are drawn in
+/// rounds of their own.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ViewOrder {
     random: Random,
-    views: usize,
-    left: Vec<usize>,
+    /// Number of views of photos and of virtual views, which follow them.
+    counts: [usize; 2],
+    /// Views that the present rounds still lack.
+    left: [Vec<usize>; 2],
+    drawn: usize,
 }
 
+/// Every third view is a virtual one, if there are any.
+const VIRTUAL_EVERY: usize = 3;
+
 impl ViewOrder {
-    /// Order over `0..views` for a seed.
-    pub fn new(views: usize, seed: u64) -> Self {
-        ViewOrder { random: Random::new(seed), views, left: Vec::new() }
+    /// Order over `views` photos and the virtual views behind them, for a seed.
+    pub fn new(views: usize, virtual_views: usize, seed: u64) -> Self {
+        ViewOrder {
+            random: Random::new(seed),
+            counts: [views, virtual_views],
+            left: Default::default(),
+            drawn: 0,
+        }
     }
 
     /// Draws the next view.
     pub fn draw(&mut self) -> usize {
-        if self.left.is_empty() {
-            self.left = (0..self.views).collect();
-            self.random.shuffle(&mut self.left);
+        self.drawn += 1;
+        let kind = usize::from(self.counts[1] > 0 && self.drawn.is_multiple_of(VIRTUAL_EVERY));
+        let left = &mut self.left[kind];
+        if left.is_empty() {
+            let first = kind * self.counts[0];
+            *left = (first..first + self.counts[kind]).collect();
+            self.random.shuffle(left);
         }
-        self.left.pop().unwrap_or(0)
+        left.pop().unwrap_or(0)
     }
 }
 
@@ -71,11 +87,19 @@ mod tests {
 
     #[test]
     fn view_order_draws_each_view_once() {
-        let mut order = ViewOrder::new(4, 7);
+        let mut order = ViewOrder::new(4, 0, 7);
         for _ in 0..10 {
             let mut round: Vec<usize> = (0..4).map(|_| order.draw()).collect();
             round.sort_unstable();
             assert_eq!(round, [0, 1, 2, 3]);
         }
+        // Two photos and three virtual views.
+        let mut order = ViewOrder::new(2, 3, 7);
+        let (mut photos, mut others): (Vec<usize>, Vec<usize>) =
+            (0..18).map(|_| order.draw()).partition(|view| *view < 2);
+        assert_eq!((photos.len(), others.len()), (12, 6));
+        photos.chunks_mut(2).for_each(|round| round.sort_unstable());
+        others.chunks_mut(3).for_each(|round| round.sort_unstable());
+        assert!(photos.chunks(2).all(|r| r == [0, 1]) && others.chunks(3).all(|r| r == [2, 3, 4]));
     }
 }

@@ -109,17 +109,17 @@ impl Trainer {
         raster: RasterOptions,
         model: Model,
         views: Views,
-        cameras: &[Camera],
-        seed: u64,
+        cameras: Vec<Camera>,
+        order: ViewOrder,
     ) -> Trainer {
         Trainer {
             device: device.clone(),
             raster,
             model,
             views,
-            cameras: cameras.to_vec(),
-            order: ViewOrder::new(cameras.len(), seed),
+            order,
             programs: cameras.iter().map(|_| None).collect(),
+            cameras,
             group: 0,
         }
     }

@@ -6,9 +6,11 @@ use crate::pass::metrics::planar;
 use crate::pass::ssim_l1::SsimL1;
 use crate::pass::view::View;
 use crate::pass::{FrameBuffers, RasterOptions, Rasterizer};
-use crate::scene::{Camera, Coverage, DepthMap, Outside, RgbImage};
+use crate::scene::{Camera, DepthMap, Outside, RgbImage};
 use crate::{Error, Result};
 
+use super::half_res::Photos;
+use super::losses::Losses;
 use super::model::Model;
 
 /// One training view.
@@ -20,8 +22,9 @@ pub(super) struct TrainView {
     pub(super) target: Vec<Buffer<f32>>,
     /// Sum of the pixel weights, where there are some.
     pub(super) covered: Option<f64>,
-    /// Per band [rows, W] the wanted alpha, −1 in the halo; for photos with an empty background.
-    pub(super) alpha: Option<Vec<Buffer<f32>>>,
+    /// Per band [rows, W] the wanted alpha, −1 in the halo, and its weight per pixel
+    /// ([`Losses::wanted_alpha`]).
+    pub(super) alpha: Option<(Vec<Buffer<f32>>, f64)>,
     /// Per band [rows, W] depth where it is confident, 0 elsewhere and in the halo; and the number
     /// of confident pixels.
     pub(super) depth: Option<(Vec<Buffer<f32>>, usize)>,
@@ -66,37 +69,45 @@ pub(super) struct Views {
 }
 
 impl Views {
-    /// Uploads photos and depth and allocates the rasterisers, for `capacity` splats with
-    /// `feature_dim` features.
+    /// Uploads the photos and the inputs of the losses, and allocates the rasterisers, for
+    /// `capacity` splats with `feature_dim` features. Depth is used from `min_confidence` on.
     pub(super) fn new(
         device: &Device,
-        images: &[RgbImage],
-        cameras: &[Camera],
-        depths: Option<(&[DepthMap], f32)>,
-        coverage: &[Option<Coverage>],
+        photos: Photos,
+        losses: (&Losses, f32),
         capacity: usize,
         feature_dim: usize,
         near: f64,
     ) -> Result<Self> {
-        check_inputs(images, cameras)?;
         let mut views = Views { list: Vec::new(), stages: Vec::new(), near };
+        views.add(device, photos, losses, capacity, feature_dim)?;
+        Ok(views)
+    }
+
+    /// Adds photos behind the others.
+    pub(super) fn add(
+        &mut self,
+        device: &Device,
+        Photos { images, cameras, depths, coverage }: Photos,
+        (losses, min_confidence): (&Losses, f32),
+        capacity: usize,
+        feature_dim: usize,
+    ) -> Result<()> {
+        let depths = depths.filter(|_| losses.depth.is_some());
+        check_inputs(images, cameras)?;
         for (i, image) in images.iter().enumerate() {
             let size = [image.width as u32, image.height as u32];
             let same = |s: &SizeBuffers| [s.raster.frame().width, s.raster.frame().height] == size;
-            let stage = match views.stages.iter().position(same) {
+            let stage = match self.stages.iter().position(same) {
                 Some(found) => found,
                 None => {
-                    views.stages.push(SizeBuffers::new(device, capacity, feature_dim, size)?);
-                    views.stages.len() - 1
+                    self.stages.push(SizeBuffers::new(device, capacity, feature_dim, size)?);
+                    self.stages.len() - 1
                 }
             };
-            let depth = match depths {
-                Some((maps, least)) => {
-                    maps.get(i).map(|m| confident_depth(m, least, image)).transpose()?.flatten()
-                }
-                None => None,
-            };
-            let bands = &views.stages[stage].raster.frame().bands;
+            let depth = depths.and_then(|maps| maps.get(i));
+            let depth = depth.map(|m| confident_depth(m, min_confidence, image)).transpose()?.flatten();
+            let bands = &self.stages[stage].raster.frame().bands;
             let depth = match depth {
                 Some((map, count)) => {
                     let band = |b| device.buffer_from("stereo depth", &bands.cut_inner(&b, &map, 0.0));
@@ -117,17 +128,16 @@ impl Views {
             };
             let target = bands.iter().map(|b| device.buffer_from("photo", &bands.cut(&b, &photo)));
             let target = target.collect::<gpu::Result<_>>()?;
-            let alpha = match coverage {
-                Some(c) if c.outside == Outside::Empty => {
-                    let band =
-                        |b| device.buffer_from("wanted alpha", &bands.cut_inner(&b, &c.share.data, -1.0));
-                    Some(bands.iter().map(band).collect::<gpu::Result<_>>()?)
+            let alpha = match losses.wanted_alpha(image.data.len(), coverage) {
+                Some((alpha, weight)) => {
+                    let band = |b| device.buffer_from("wanted alpha", &bands.cut_inner(&b, &alpha, -1.0));
+                    Some((bands.iter().map(band).collect::<gpu::Result<_>>()?, weight))
                 }
-                _ => None,
+                None => None,
             };
-            views.list.push(TrainView { stage, target, covered, alpha, depth });
+            self.list.push(TrainView { stage, target, covered, alpha, depth });
         }
-        Ok(views)
+        Ok(())
     }
 
     /// Buffers of the size of a view.

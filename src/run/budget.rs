@@ -56,6 +56,8 @@ pub struct MemoryDemand {
     pub features: usize,
     /// Maximum number of splats.
     pub splats: usize,
+    /// Virtual views, at half the size of the photos.
+    pub virtual_views: usize,
 }
 
 impl MemoryDemand {
@@ -70,7 +72,8 @@ impl MemoryDemand {
     pub fn colour(preset: Preset, photos: usize) -> MemoryDemand {
         let options = RgbOptions::preset(preset);
         let margin = if options.margin > 0.0 { MARGIN * photos } else { 0 };
-        MemoryDemand { features: 0, splats: options.init.max_points + margin }
+        let (splats, virtual_views) = (options.init.max_points + margin, options.virtual_views);
+        MemoryDemand { features: 0, splats, virtual_views }
     }
 }
 
@@ -105,7 +108,11 @@ pub fn stages(
     // Freed memory stays with the process, so the maximum counts in all stages.
     let host = HOST_BASE + HOST_PIXEL * all + STEREO_PIXEL * matched + network;
     let stereo = StageMemory { name: "dense stereo", device: 24 * matched, host };
-    let colour = StageMemory { name: "splats", device: training_bytes(device, sizes, work.splats, 0)?, host };
+    let virtual_sizes = sizes.iter().cycle().take(work.virtual_views);
+    let half = virtual_sizes.map(|(w, h)| (w.div_ceil(2), h.div_ceil(2)));
+    let trained: Vec<(usize, usize)> = sizes.iter().copied().chain(half).collect();
+    let bytes = training_bytes(device, &trained, work.splats, 0)?;
+    let colour = StageMemory { name: "splats", device: bytes, host };
     let mut stages = vec![stereo, colour];
     if work.features > 0 {
         let bytes = training_bytes(device, sizes, work.splats, work.features)?;
@@ -142,8 +149,8 @@ fn training_bytes(
         // sort; eight entries of 20 bytes in the lists.
         bytes += splats * (96 + 8 * features as u64 + 16 + 160);
     }
-    // Photo, depth, and a label per level.
-    bytes += sizes.iter().map(pixels).sum::<u64>() * (12 + if features > 0 { 12 } else { 4 });
+    // Photo, wanted alpha; depth, or a label per level.
+    bytes += sizes.iter().map(pixels).sum::<u64>() * (16 + if features > 0 { 12 } else { 4 });
     // Value, gradient and two moments of each parameter, at SH degree 0; the fused update stores no
     // gradients but those of the features.
     let geometry = if UpdateKernel::of(device) == UpdateKernel::Fused { 12 * 14 } else { 16 * 14 };

@@ -75,8 +75,8 @@ fn each_loss_trains_its_own_target() {
         .collect();
     let scale = SceneScale::measure(&cameras, &start.means);
     let photos = Photos { images: &images, cameras: &cameras, depths: Some(&depths), coverage: &[] };
-    let trained = |depth, needles| {
-        let losses = Losses { l1: 0.0, dssim: 0.0, depth, needles };
+    let off = Losses { l1: 0.0, dssim: 0.0, ..Losses::PHOTOS };
+    let trained = |losses| {
         let preset = RgbOptions::preset(Preset::Draft);
         let options =
             RgbOptions { losses, iterations: 10, half_res: 0.0, poses: None, bounded: false, ..preset };
@@ -87,17 +87,28 @@ fn each_loss_trains_its_own_target() {
         let range = |s: &[f32; 3]| s[0].max(s[1]).max(s[2]) - s[0].min(s[1]).min(s[2]);
         splats.log_scales.iter().map(range).fold(0.0, f32::max)
     };
+    let rendered =
+        |splats: &Splats| Renderer::new(&device, splats, &[], 0).unwrap().render(&cameras[0]).unwrap();
     let depth_error = |splats: &Splats| {
-        let shown = Renderer::new(&device, splats, &[], 0).unwrap().render(&cameras[0]).unwrap().depth;
-        let pairs = shown.data.iter().zip(&depths[0].depth.data).filter(|(z, d)| **z > 0.0 && **d > 0.0);
+        let pairs = rendered(splats)
+            .depth
+            .data
+            .into_iter()
+            .zip(&depths[0].depth.data)
+            .filter(|(z, d)| *z > 0.0 && **d > 0.0);
         pairs.map(|(z, d)| f64::from((z - d).abs() / d)).sum::<f64>()
     };
-    assert_eq!(trained(None, None), start);
-    let (round, moved) = (trained(None, Some(1.0)), trained(Some(1.0), None));
+    let opacity = |splats: &Splats| rendered(splats).alpha.data.iter().sum::<f32>();
+    assert_eq!(trained(off), start);
+    let round = trained(Losses { needles: Some(1.0), ..off });
+    let moved = trained(Losses { depth: Some(1.0), ..off });
+    let opaque = trained(Losses { opacity: Some(1.0), ..off });
     let ratios = [&round, &moved, &start].map(largest_ratio);
     assert!(ratios[0] < ratios[2], "{ratios:?}");
     let errors = [&moved, &round, &start].map(depth_error);
     assert!(errors[0] < 0.9 * errors[2], "{errors:?}");
+    let alphas = [&opaque, &start].map(opacity);
+    assert!(alphas[0] > 1.05 * alphas[1], "{alphas:?}");
 }
 
 /// Coverage of the left half of a photo.
