@@ -1,6 +1,7 @@
 //! Dense multi-view stereo with known cameras: slanted plane sweep, propagation, consistency
 //! checks, filling, and fusion into points.
 mod colours;
+mod faces;
 mod fill;
 mod fuse;
 mod matcher;
@@ -158,6 +159,10 @@ pub fn finish(
     let fused = prior::fuse_priors(level, &poses, &inferred, priors, options.seed, progress);
     progress.step(3, "filling");
     let complete = fill::fill(level, &poses, &fused, &large, void);
+    let complete = match faces::faces(level, &poses, &fused, &complete, &large, options.seed) {
+        Some(with_faces) => fill::fill(level, &poses, &with_faces, &large, void),
+        None => complete,
+    };
     progress.step(4, "points");
     let points = fuse::fuse(level, &poses, &complete);
     let mut depths: Vec<DepthMap> =

@@ -1,0 +1,356 @@
+//! Faces that one photo alone shows, such as the side of a box that the other photos see from the
+//! front.
+//!
+//! Filling gives such a face the plane of a neighbour, mostly of the surface behind it. Another
+//! view then shows that place in a different colour. The pixels that other views refute in this way
+//! form faces; a face gets the plane through pixels at its rim that no view refutes: in the other
+//! views it lies behind the surface in front, or outside of the image.
+use super::Level;
+use super::fill::COLOUR_TOLERANCE;
+use super::planes::WorldPlane;
+use super::regions::INFERRED;
+use super::surface::{RelativePoses, Surface, Visibility, neighbours, ray};
+use crate::math::hash;
+use glam::{Mat3, Vec3};
+use rayon::prelude::*;
+
+/// Smallest face, share of the image; smaller groups of refuted pixels are edges.
+const SMALLEST: f32 = 4e-4;
+/// Width of the rim, share of the view's width: the trimmed depth edge and half the matching window.
+const RIM_SHARE: f32 = 1.0 / 50.0;
+/// Hypotheses per kind: through three pixels of the rim, and through two along an axis.
+const TRIALS: u32 = 400;
+/// Approximate number of pixels of a face, and of its rim, that a hypothesis is tested on.
+const TESTED: usize = 150;
+/// Largest share of the tested pixels that other views may refute.
+const REFUTED_SHARE: f32 = 0.1;
+/// Least share of the rim on the plane.
+const RIM_INLIERS: f32 = 0.15;
+/// Factor on the rim of a plane along an axis: most corners are right angles, and the rim often leaves
+/// the tilt about its front edge open.
+const RIGHT_ANGLE: f32 = 1.2;
+/// The nearest plane counts of those with at least this share of the most pixels of the rim.
+const NEAREST_OF: f32 = 0.4;
+/// Most axes: the normals of large planes, along which boxes on them have their edges.
+const AXES: usize = 3;
+
+/// Replaces the filled planes of faces in `complete` and returns the surface from which to fill
+/// again: `known` with the planes of the faces. `None` where there are no faces.
+pub fn faces(
+    level: &Level,
+    poses: &RelativePoses,
+    known: &Surface,
+    complete: &Surface,
+    large: &[WorldPlane],
+    seed: u32,
+) -> Option<Surface> {
+    let views = (0..level.cameras.len()).into_par_iter();
+    let found: Vec<(usize, Vec3)> = views
+        .flat_map_iter(|view| View::new(level, poses, known, complete, view).faces(large, seed))
+        .collect();
+    if found.is_empty() {
+        return None;
+    }
+    let mut out = known.clone();
+    for (index, plane) in found {
+        out.planes[index] = plane;
+        out.confidence[index] = INFERRED;
+    }
+    Some(out)
+}
+
+struct View<'a> {
+    level: &'a Level,
+    poses: &'a RelativePoses,
+    known: &'a Surface,
+    complete: &'a Surface,
+    view: usize,
+    width: usize,
+    height: usize,
+    first: usize,
+}
+
+impl<'a> View<'a> {
+    fn new(
+        level: &'a Level,
+        poses: &'a RelativePoses,
+        known: &'a Surface,
+        complete: &'a Surface,
+        view: usize,
+    ) -> Self {
+        let r = &level.references[view];
+        let (width, height, first) = (r.width as usize, r.height as usize, r.first as usize);
+        View { level, poses, known, complete, view, width, height, first }
+    }
+
+    /// Pixels of faces with their planes.
+    fn faces(&self, large: &[WorldPlane], seed: u32) -> Vec<(usize, Vec3)> {
+        let refuted: Vec<bool> = (0..self.width * self.height)
+            .map(|k| {
+                let index = self.first + k;
+                let is_filled = self.known.confidence[index] <= 0.0 && self.complete.confidence[index] > 0.0;
+                is_filled && self.refutes(k, self.complete.planes[index])
+            })
+            .collect();
+        let mut out = Vec::new();
+        for face in self.components(&refuted) {
+            let Some(plane) = self.plane_of(&face, &refuted, large, hash(seed ^ face[0] as u32)) else {
+                continue;
+            };
+            let sound = face.iter().filter(|k| !self.refutes(**k, plane));
+            out.extend(sound.map(|k| (self.first + k, plane)));
+        }
+        out
+    }
+
+    /// Connected groups of refuted pixels, without the small ones.
+    fn components(&self, refuted: &[bool]) -> Vec<Vec<usize>> {
+        let smallest = (SMALLEST * refuted.len() as f32) as usize;
+        let mut done = vec![false; refuted.len()];
+        let mut out = Vec::new();
+        for start in (0..refuted.len()).filter(|k| refuted[*k]) {
+            if done[start] {
+                continue;
+            }
+            done[start] = true;
+            let mut group = vec![start];
+            let mut next = 0;
+            while next < group.len() {
+                for n in neighbours(group[next], self.width, self.height) {
+                    if refuted[n] && !done[n] {
+                        done[n] = true;
+                        group.push(n);
+                    }
+                }
+                next += 1;
+            }
+            if group.len() >= smallest.max(1) {
+                out.push(group);
+            }
+        }
+        out
+    }
+
+    fn ray(&self, k: usize) -> Vec3 {
+        ray(self.level, self.view, k % self.width, k / self.width)
+    }
+
+    /// Whether another view refutes a plane at a pixel: it sees through the point, or shows it in
+    /// another colour. A plane beyond the searched depth is refuted, too.
+    fn refutes(&self, k: usize, plane: Vec3) -> bool {
+        let ray = self.ray(k);
+        let inverse = plane.dot(ray);
+        let [far, near] = self.level.references[self.view].range;
+        if inverse < 0.5 * far || inverse > 2.0 * near {
+            return true;
+        }
+        let (x, y) = (k % self.width, k / self.width);
+        let (pixel, point) = ([x as f32 + 0.5, y as f32 + 0.5], ray / inverse);
+        let visibility =
+            |surface, other| self.poses.visibility(self.level, surface, self.view, other, pixel, point);
+        (0..self.level.cameras.len()).filter(|other| *other != self.view).any(|other| {
+            // Filled depth of another view is no proof of free space, but mostly right: a wrong
+            // plane seldom has its colour there by chance.
+            visibility(self.known, other) == Visibility::FreeSpace
+                || visibility(self.complete, other) == Visibility::Agrees
+                    && !self.same_colour(k, other, point)
+        })
+    }
+
+    fn same_colour(&self, k: usize, other: usize, point: Vec3) -> bool {
+        let Some((u, v, _)) = self.poses.project(self.level, self.view, other, point) else { return true };
+        let (here, there) =
+            (self.level.guide[self.view].data[k], self.level.guide[other].at(u as usize, v as usize));
+        (0..3).map(|c| (here[c] - there[c]).powi(2)).sum::<f32>().sqrt() < COLOUR_TOLERANCE
+    }
+
+    /// The nearest of the planes with many pixels of the rim on them that no view refutes.
+    fn plane_of(&self, face: &[usize], refuted: &[bool], large: &[WorldPlane], seed: u32) -> Option<Vec3> {
+        let rim = self.rim(face, refuted);
+        if rim.len() < 12 {
+            return None;
+        }
+        let tested = every(face, TESTED);
+        let rotation = self.level.cameras[self.view].pose.rotation;
+        let axes: Vec<Vec3> = large.iter().take(AXES).map(|p| (rotation * p.normal).as_vec3()).collect();
+        let mut state = seed;
+        let mut draw = || {
+            state = hash(state);
+            rim[state as usize % rim.len()]
+        };
+        let mut planes = Vec::new();
+        for axis in &axes {
+            for _ in 0..TRIALS {
+                planes.extend(along_axis([draw(), draw()], *axis).map(|plane| (plane, RIGHT_ANGLE)));
+            }
+        }
+        for _ in 0..TRIALS {
+            planes.extend(through_points([draw(), draw(), draw()]).map(|plane| (plane, 1.0)));
+        }
+        let tolerance = self.level.tolerance[self.view];
+        let inliers = |plane: Vec3| {
+            let on = |(ray, inverse): &&(Vec3, f32)| (plane.dot(*ray) - inverse).abs() < tolerance * inverse;
+            rim.iter().filter(on).count()
+        };
+        let most_refuted = (REFUTED_SHARE * tested.len() as f32) as usize;
+        let is_sound = |plane: &Vec3| {
+            let mut wrong = 0;
+            tested.iter().all(|k| {
+                wrong += usize::from(self.refutes(*k, *plane));
+                wrong <= most_refuted
+            })
+        };
+        let least = RIM_INLIERS * rim.len() as f32;
+        let mut scored: Vec<(f32, Vec3)> =
+            planes.into_iter().map(|(plane, factor)| (factor * inliers(plane) as f32, plane)).collect();
+        scored.retain(|(score, _)| *score >= least);
+        // The order of equal ones is that of the draws.
+        scored.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let mut sound = scored.into_iter().filter(|(_, plane)| is_sound(plane));
+        let best = sound.next()?;
+        // A plane further back leaves a gap to the surface in front, and hides there, too.
+        let enough = sound.take_while(|(score, _)| *score >= NEAREST_OF * best.0);
+        let middle = self.ray(face[face.len() / 2]);
+        let inverse = |plane: &Vec3| plane.dot(middle);
+        let nearer = |a: Vec3, b: Vec3| if inverse(&b) > inverse(&a) { b } else { a };
+        Some(enough.map(|(_, plane)| plane).fold(best.1, nearer))
+    }
+
+    /// Rays and inverse depths of pixels around a face, of those that no view refutes.
+    fn rim(&self, face: &[usize], refuted: &[bool]) -> Vec<(Vec3, f32)> {
+        let radius = ((RIM_SHARE * self.width as f32) as usize).max(4);
+        let mut near = vec![false; self.width * self.height];
+        for k in face {
+            let (x, y) = (k % self.width, k / self.width);
+            for py in y.saturating_sub(radius)..(y + radius + 1).min(self.height) {
+                let row = py * self.width;
+                near[row + x.saturating_sub(radius)..row + (x + radius + 1).min(self.width)].fill(true);
+            }
+        }
+        let known = |k: &usize| near[*k] && !refuted[*k] && self.complete.confidence[self.first + k] > 0.0;
+        let pixels: Vec<usize> = (0..near.len()).filter(known).collect();
+        let value = |k: usize| {
+            let ray = self.ray(k);
+            (ray, self.complete.planes[self.first + k].dot(ray))
+        };
+        every(&pixels, 4 * TESTED).into_iter().map(value).filter(|(_, inverse)| *inverse > 0.0).collect()
+    }
+}
+
+/// About `count` of the values, evenly.
+fn every(values: &[usize], count: usize) -> Vec<usize> {
+    values.iter().copied().step_by((values.len() / count).max(1)).collect()
+}
+
+/// The plane through three points, given by ray and inverse depth.
+fn through_points([a, b, c]: [(Vec3, f32); 3]) -> Option<Vec3> {
+    let rows = Mat3::from_cols(a.0, b.0, c.0).transpose();
+    // Nearly collinear rays leave the tilt open.
+    if rows.determinant().abs() < 1e-5 {
+        return None;
+    }
+    Some(rows.inverse() * Vec3::new(a.1, b.1, c.1))
+}
+
+/// The plane through two points that contains a direction.
+fn along_axis([a, b]: [(Vec3, f32); 2], axis: Vec3) -> Option<Vec3> {
+    let (p, q) = (a.0 / a.1, b.0 / b.1);
+    let normal = (q - p).cross(axis).try_normalize()?;
+    let offset = normal.dot(p);
+    (offset.abs() > 1e-6 * p.length()).then(|| normal / offset)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::surface::map_pixels;
+    use super::super::{StereoOptions, fill, planes, pyramid};
+    use super::*;
+    use crate::scene::{Camera, Pose, RgbImage};
+    use glam::{DVec2, DVec3};
+
+    const WIDTH: usize = 160;
+    const HEIGHT: usize = 120;
+
+    /// Front of a box, its left side, or the wall behind, at the end of a ray; with its colour.
+    fn hit(camera: &Camera, pixel: DVec2) -> (DVec3, [f32; 3]) {
+        let (centre, ray) = (camera.pose.centre(), camera.ray(pixel));
+        let front = centre + 2.0 * ray;
+        if front.x.abs() < 0.3 && front.y.abs() < 0.3 {
+            return (front, [0.8, 0.3 + 0.2 * (9.0 * front.x).sin() as f32, 0.2]);
+        }
+        let side = centre + ray * ((-0.3 - centre.x) / ray.x);
+        if ray.x > 0.0 && centre.x < -0.3 && (2.0..2.6).contains(&side.z) && side.y.abs() < 0.3 {
+            return (side, [0.7, 0.2, 0.2]);
+        }
+        let wall = centre + 4.0 * ray;
+        (wall, [0.2, 0.6, 0.5 + 0.2 * (5.0 * wall.x).sin() as f32])
+    }
+
+    fn camera(x: f64) -> Camera {
+        Camera {
+            name: x.to_string(),
+            width: WIDTH as u32,
+            height: HEIGHT as u32,
+            fx: 110.0,
+            fy: 110.0,
+            cx: 80.0,
+            cy: 60.0,
+            pose: Pose { translation: DVec3::new(-x, 0.0, 0.0), ..Pose::IDENTITY },
+        }
+    }
+
+    fn pixel(k: usize) -> DVec2 {
+        DVec2::new((k % WIDTH) as f64 + 0.5, (k / WIDTH) as f64 + 0.5)
+    }
+
+    #[test]
+    fn side_of_box_gets_its_plane() {
+        // The first camera alone stands to the left of the box.
+        let cameras = [camera(-0.9), camera(0.0), camera(0.4)];
+        let images = cameras.each_ref().map(|c| RgbImage {
+            width: WIDTH,
+            height: HEIGHT,
+            data: (0..WIDTH * HEIGHT).map(|k| hit(c, pixel(k)).1).collect(),
+        });
+        let sparse: Vec<DVec3> =
+            (0..WIDTH * HEIGHT).step_by(97).map(|k| hit(&cameras[0], pixel(k)).0).collect();
+        let options = StereoOptions { rounds: vec![1], ..StereoOptions::default() };
+        let level = pyramid(&images, &cameras, &sparse, &options).unwrap().pop().unwrap();
+        let poses = RelativePoses::new(&level);
+        let at = |view: usize, x: usize, y: usize| hit(&cameras[view], pixel(y * WIDTH + x)).0;
+        // All views match the front and the wall where another one shows them, too.
+        let planes = map_pixels(&level, |view, x, y, _| Vec3::Z / at(view, x, y).z as f32);
+        let shown = |point: DVec3, other: usize| {
+            let (p, z) = cameras[other].project(point);
+            let inside = p.x >= 0.0 && p.y >= 0.0 && p.x < WIDTH as f64 && p.y < HEIGHT as f64;
+            inside && z > 0.0 && (hit(&cameras[other], p).0 - point).length() < 0.02
+        };
+        let is_side = |point: DVec3| (2.001..2.61).contains(&point.z);
+        let confidence = map_pixels(&level, |view, x, y, _| {
+            let point = at(view, x, y);
+            let twice = (0..3).any(|other| other != view && shown(point, other));
+            if twice && !is_side(point) { 0.9 } else { 0.0 }
+        });
+        let known = Surface { planes, confidence };
+        let void = vec![false; level.pixels()];
+        let large = planes::large_planes(&level, &known, 1);
+        let complete = fill::fill(&level, &poses, &known, &large, &void);
+        let with_faces = faces(&level, &poses, &known, &complete, &large, 1).unwrap();
+        let after = fill::fill(&level, &poses, &with_faces, &large, &void);
+        let side: Vec<usize> =
+            (0..WIDTH * HEIGHT).filter(|k| is_side(hit(&cameras[0], pixel(*k)).0)).collect();
+        let wrong = |surface: &Surface| {
+            let error = |k: &usize| {
+                let found = surface.planes[*k].dot(ray(&level, 0, k % WIDTH, k / WIDTH));
+                (f64::from(found) * hit(&cameras[0], pixel(*k)).0.z - 1.0).abs()
+            };
+            side.iter().filter(|k| error(k) > 0.03).count()
+        };
+        let (before, now) = (wrong(&complete), wrong(&after));
+        println!("side {} pixels, wrong {before} -> {now}", side.len());
+        assert!(before > side.len() / 2 && now * 20 < side.len(), "{before} -> {now} of {}", side.len());
+        // Nothing else is a face.
+        let others = with_faces.confidence[WIDTH * HEIGHT..].iter().filter(|c| **c == INFERRED).count();
+        assert_eq!(others, 0);
+    }
+}
