@@ -54,10 +54,12 @@ function slerp(a, b, t) {
 }
 
 /// Movable camera. `focal` and `shift`, the offset of the principal point from the image centre,
-/// are in units of the image height; `distance` is the distance to the pivot.
+/// are in units of the image height; `distance` is the distance to the pivot. With `cover` 0 the
+/// picture includes the whole photo, with 1 the photo fills the picture; `inset` moves the image
+/// centre, in shares of width and height.
 export class Camera {
-  constructor({ rotation, position, focal, shift = [0, 0], ratio = 4 / 3, aspect = 1, distance = 1 }) {
-    Object.assign(this, { rotation, position, focal, shift, ratio, aspect, distance });
+  constructor({ rotation, position, focal, shift = [0, 0], ratio = 4 / 3, aspect = 1, distance = 1, cover = 0, inset = [0, 0] }) {
+    Object.assign(this, { rotation, position, focal, shift, ratio, aspect, distance, cover, inset });
   }
 
   /// Camera of a photo.
@@ -86,17 +88,24 @@ export class Camera {
     return add(this.position, scale(this.rotation.slice(6), this.distance));
   }
 
-  /// fx, fy, cx, cy for an image of this size, whose field of view includes that of the photo.
+  /// fx, fy, cx, cy for an image of this size.
   intrinsics(width, height) {
-    const unitLength = Math.min(height, width / this.ratio);
-    const fy = this.focal * unitLength;
-    return [fy * this.aspect, fy, width / 2 + this.shift[0] * unitLength, height / 2 + this.shift[1] * unitLength];
+    const heights = [height, width / this.ratio];
+    const unitLength = Math.min(...heights) ** (1 - this.cover) * Math.max(...heights) ** this.cover;
+    const fy = this.focal * unitLength, [x, y] = [0.5 + this.inset[0], 0.5 + this.inset[1]];
+    return [fy * this.aspect, fy, width * x + this.shift[0] * unitLength, height * y + this.shift[1] * unitLength];
   }
 
-  /// Rotates about the pivot: `yaw` about the world's up, `pitch` about the horizontal camera axis,
-  /// radians.
+  /// Rotates about the pivot, as [`look`].
   orbit(yaw, pitch, up) {
     const pivot = this.pivot;
+    this.look(yaw, pitch, up);
+    this.position = sub(pivot, scale(this.rotation.slice(6), this.distance));
+  }
+
+  /// Rotates about the camera: `yaw` about the world's up, `pitch` about the horizontal camera
+  /// axis, radians.
+  look(yaw, pitch, up) {
     const forward = this.rotation.slice(6), right = this.rotation.slice(0, 3);
     // Stays 5 degrees off the vertical, where left and right would swap.
     const height = Math.asin(Math.max(-1, Math.min(1, dot(forward, up))));
@@ -105,7 +114,14 @@ export class Camera {
     const turn = multiply(about(up, yaw), about(right, tilt));
     // Normalised as a quaternion, so that many small rotations stay a rotation.
     this.rotation = fromQuaternion(normalised(toQuaternion(multiply(this.rotation, transpose(turn)))));
-    this.position = sub(pivot, scale(this.rotation.slice(6), this.distance));
+  }
+
+  /// Removes the roll. A camera that looks along the vertical has none.
+  straighten(up) {
+    const forward = this.rotation.slice(6);
+    if (Math.abs(dot(forward, up)) > 0.95) return;
+    const right = unit(cross(forward, up));
+    this.rotation = [...right, ...cross(forward, right), ...forward];
   }
 
   /// Moves along the camera axes, world units.
@@ -113,16 +129,25 @@ export class Camera {
     this.position = add(this.position, unrotate(this.rotation, [x, y, z]));
   }
 
-  /// Moves towards the pivot (factor below 1) or away from it.
-  dolly(factor) {
-    const pivot = this.pivot;
-    this.distance *= factor;
-    this.position = sub(pivot, scale(this.rotation.slice(6), this.distance));
+  /// Moves towards a point (factor below 1) or away from it, not nearer than `closest`. The point
+  /// keeps its place in the picture, and the pivot gets its depth.
+  zoom(point, factor, closest) {
+    this.aim(point);
+    const by = factor < 1 ? Math.max(factor, Math.min(1, closest / this.distance)) : factor;
+    this.position = add(point, scale(sub(this.position, point), by));
+    this.distance *= by;
   }
 
   /// Sets the depth of a point as the distance of the pivot, without rotation.
   aim(point) {
     this.distance = Math.max(dot(sub(point, this.position), this.rotation.slice(6)), 1e-6);
+  }
+
+  /// Moves back until a sphere is in the picture.
+  frame(centre, radius) {
+    this.distance = 2 * this.focal * radius / Math.min(1, this.ratio);
+    this.position = sub(centre, scale(this.rotation.slice(6), this.distance));
+    [this.cover, this.shift] = [0, [0, 0]];
   }
 
   /// Pixel position and depth of a world point.
@@ -140,12 +165,13 @@ export class Camera {
 
   /// Interpolates between two cameras at t in [0, 1].
   static between(a, b, t) {
-    const k = mix([a.focal, a.ratio, a.aspect, a.distance], [b.focal, b.ratio, b.aspect, b.distance], t);
+    const numbers = (c) => [c.focal, c.ratio, c.aspect, c.distance, c.cover];
+    const k = mix(numbers(a), numbers(b), t);
     return new Camera({
       rotation: fromQuaternion(slerp(toQuaternion(a.rotation), toQuaternion(b.rotation), t)),
       position: mix(a.position, b.position, t),
       shift: mix(a.shift, b.shift, t),
-      focal: k[0], ratio: k[1], aspect: k[2], distance: k[3],
+      focal: k[0], ratio: k[1], aspect: k[2], distance: k[3], cover: k[4],
     });
   }
 }

@@ -14,6 +14,16 @@ export function lengthText(units, metres) {
   return m < 1 ? `${short(100 * m)} cm` : `${short(m)} m`;
 }
 
+/// Metres per unit of length that people write; a plain number is in metres.
+const METRES = { "": 1, mm: 0.001, cm: 0.01, dm: 0.1, m: 1, km: 1000, in: 0.0254, '"': 0.0254, ft: 0.3048, "'": 0.3048 };
+
+/// Metres of a text such as 0.2, 0,2 m, 20 cm or 8 in; null if it is no length.
+export function parseLength(text) {
+  const parts = /^\s*(\d+(?:[.,]\d*)?|[.,]\d+)\s*([a-z"']*)\s*$/i.exec(text);
+  const metres = parts && Number(parts[1].replace(",", ".")) * METRES[parts[2].toLowerCase()];
+  return metres > 0 ? metres : null;
+}
+
 export class Tape {
   /// `box` holds the length (output), the true length (input) and a button to copy; `drawing` is
   /// the svg. `metres` is the length of the scene unit, if it is known.
@@ -21,6 +31,10 @@ export class Tape {
     Object.assign(this, { box, drawing, metres, points: [], active: false });
     this.input = box.querySelector("input");
     this.input.oninput = () => this.#updateScale();
+    this.input.onchange = () => {
+      const text = this.input.value;
+      if (text && !parseLength(text)) say(`“${text}” is not a length. Write it like 0.2, 20 cm, 200 mm or 8 in.`);
+    };
     box.querySelector("button").onclick = async () => {
       try {
         await navigator.clipboard.writeText(this.stated());
@@ -54,14 +68,15 @@ export class Tape {
   /// Option text for `splatvk measure`.
   stated() {
     const place = (p) => p.map((v) => Number(v.toFixed(5))).join(",");
-    const is = Number(this.input.value) > 0 ? this.input.value : "METRES";
+    const metres = parseLength(this.input.value), is = metres ? Number(metres.toPrecision(6)) : "METRES";
     return `--scale "${this.points.map(place).join(" - ")} = ${is}"`;
   }
 
   /// Sets the scale from a true length, so that other lengths are shown in metres.
   #updateScale() {
-    const metres = Number(this.input.value);
-    if (metres > 0 && this.units > 0) this.metres = metres / this.units;
+    const metres = parseLength(this.input.value);
+    if (metres && this.units > 0) this.metres = metres / this.units;
+    this.#show();
   }
 
   #show() {

@@ -27,9 +27,12 @@ const REPORT_SPLATS: usize = 300_000;
 const THUMBNAIL: usize = 104;
 
 /// Import name and text of each module.
-const MODULES: [(&str, &str); 7] = [
+const MODULES: [(&str, &str); 10] = [
     ("splatvk/camera", include_str!("camera.js")),
+    ("splatvk/controls", include_str!("controls.js")),
     ("splatvk/measure", include_str!("measure.js")),
+    ("splatvk/motion", include_str!("motion.js")),
+    ("splatvk/names", include_str!("names.js")),
     ("splatvk/pick", include_str!("pick.js")),
     ("splatvk/render", include_str!("render.js")),
     ("splatvk/sort", include_str!("sort.js")),

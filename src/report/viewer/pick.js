@@ -4,8 +4,8 @@ import { rotate } from "splatvk/camera";
 const DILATION = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.99, VOID_ALPHA = 0.5;
 
 /// Returns {depth, codes: [L] code or -1} at a pixel position, or null where alpha is below one
-/// half.
-export function pick(splats, camera, x, y, width, height, near) {
+/// half. Without `guessed`, what no photo shows is left out.
+export function pick(splats, camera, x, y, width, height, near, guessed) {
   const [fx, fy, cx, cy] = camera.intrinsics(width, height);
   const r = camera.rotation, t = camera.translation;
   const { positions, logScales, quats, opacity, antialiased } = splats;
@@ -14,6 +14,7 @@ export function pick(splats, camera, x, y, width, height, near) {
   const limits = [[-(cx + 0.15 * width) / fx, (1.15 * width - cx) / fx], [-(cy + 0.15 * height) / fy, (1.15 * height - cy) / fy]];
   const limit = (slope, [low, high]) => Math.min(Math.max(slope, low), high);
   for (let i = 0; i < splats.count; i++) {
+    if (!guessed && splats.unseen?.[i]) continue;
     const p = [positions[3 * i], positions[3 * i + 1], positions[3 * i + 2]];
     const z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
     if (!(z > near)) continue;

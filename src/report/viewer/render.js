@@ -1,33 +1,50 @@
 // WebGL 2 renderer of splats. Projection and blending are those of the Vulkan renderer
-// (glsl/shared/splat.glsl, glsl/raster_forward.comp), far to near into a half-float image; a second
-// pass maps that image to colours.
+// (glsl/shared/splat.glsl, glsl/raster_forward.comp). Three passes: the projection of every splat
+// in sorted order into a texture, the quads blended far to near into a half-float image, and the
+// map of that image to colours.
 import { half } from "splatvk/splats";
 
 export const MODES = { colour: 0, depth: 1, level: 2, relevancy: 3, unseen: 4 };
 
-const VERTEX = `#version 300 es
+/// Splats per instance. An instance has a fixed cost; measured in software, one splat per instance
+/// takes longer than all its pixels.
+const BATCH = 128;
+
+/// Splats in a row of the sorted order: whole batches, and at most the texture size that WebGL 2
+/// promises.
+const ROW = 2048;
+
+const TRIANGLE = `#version 300 es
+void main() { gl_Position = vec4(vec2((gl_VertexID & 1) * 4 - 1, (gl_VertexID & 2) * 2 - 1), 0.0, 1.0); }`;
+
+// Once per splat, not once per corner.
+const PROJECT = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
 uniform usampler2D data;     // two texels per splat: position, (r, g); (b, opacity), (log scales and unseen), quaternion
+uniform usampler2D order;    // splats, far to near
 uniform usampler2D codes;    // code + 1 per level
 uniform sampler2D sh;        // (degree + 1)² − 1 texels per splat, -1..1 of shScale
 uniform sampler2D table;     // per level two rows: (label colour, selected), (relevancy, answers)
 uniform vec3 shScale;
-uniform int shCount, mode, level, selecting, antialiased;
+uniform int count, shCount, mode, level, selecting, antialiased;
 uniform mat3 rotation;       // world to camera
 uniform vec3 translation, position;
 uniform vec4 intrinsics;     // fx, fy, cx, cy in pixels
 uniform vec2 size;
-uniform float near;
-layout(location = 0) in uint splat;
-flat out vec4 payload;       // blended values, and the opacity
-out vec2 offset;             // in standard deviations
+uniform float near, guessed; // guessed: opacity of what no photo shows
+layout(location = 0) out uvec4 place;   // centre in pixels, direction of the major axis
+layout(location = 1) out uvec4 extent;  // standard deviations in pixels, reach in those, visible
+layout(location = 2) out uvec4 payload; // blended values, opacity
 
 const float DILATION = 0.3, ALPHA_MIN = 1.0 / 255.0;
+const vec3 GREY = vec3(0.299, 0.587, 0.114);
 
 ivec2 texel(int width, int i) { return ivec2(i % width, i / width); }
 
+int splat;
+
 vec3 coefficient(int k) {
-  int i = int(splat) * shCount + k;
+  int i = splat * shCount + k;
   return texelFetch(sh, texel(textureSize(sh, 0).x, i), 0).rgb;
 }
 
@@ -47,15 +64,18 @@ vec3 harmonics(vec3 d) {
 }
 
 void main() {
-  gl_Position = vec4(0.0, 0.0, 2.0, 1.0); // nowhere
+  place = extent = payload = uvec4(0u); // invisible
+  ivec2 cell = ivec2(gl_FragCoord.xy);
+  if (cell.y * ${ROW} + cell.x >= count) return;
+  splat = int(texelFetch(order, cell, 0).x);
   int width = textureSize(data, 0).x;
-  uvec4 a = texelFetch(data, texel(width, 2 * int(splat)), 0), b = texelFetch(data, texel(width, 2 * int(splat) + 1), 0);
+  uvec4 a = texelFetch(data, texel(width, 2 * splat), 0), b = texelFetch(data, texel(width, 2 * splat + 1), 0);
   vec3 mean = uintBitsToFloat(a.xyz);
   vec3 t = rotation * mean + translation;
-  vec2 rg = unpackHalf2x16(a.w), bo = unpackHalf2x16(b.x), s01 = unpackHalf2x16(b.y);
-  float opacity = bo.y;
+  vec2 rg = unpackHalf2x16(a.w), bo = unpackHalf2x16(b.x), s01 = unpackHalf2x16(b.y), s2u = unpackHalf2x16(b.z);
+  float opacity = s2u.y > 0.5 ? bo.y * guessed : bo.y;
   if (t.z <= near || opacity < ALPHA_MIN) return;
-  vec3 scale = exp(vec3(s01, unpackHalf2x16(b.z).x));
+  vec3 scale = exp(vec3(s01, s2u.x));
   // Smallest three, as in the file.
   vec3 small = (vec3(uvec3(b.w, b.w >> 10, b.w >> 20) & 1023u) / 511.5 - 1.0) * 0.7071067811865476;
   float big = sqrt(max(0.0, 1.0 - dot(small, small)));
@@ -85,46 +105,71 @@ void main() {
   vec2 along = abs(xy) > 1e-6 * major ? normalize(vec2(xy, major - xx)) : xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
   // The quad ends where alpha falls below 1/255.
   float reach = sqrt(2.0 * log(opacity / ALPHA_MIN));
-  offset = reach * vec2((gl_VertexID & 1) * 2 - 1, (gl_VertexID & 2) - 1);
-  vec2 pixel = focal * slope + centre + offset.x * sqrt(major) * along + offset.y * sqrt(minor) * vec2(-along.y, along.x);
-  gl_Position = vec4(pixel.x / size.x * 2.0 - 1.0, 1.0 - pixel.y / size.y * 2.0, 0.0, 1.0);
+  vec2 pixel = focal * slope + centre, deviations = vec2(sqrt(major), sqrt(minor));
+  vec2 box = reach * (deviations.x * abs(along) + deviations.y * abs(along.yx));
+  if (any(lessThan(pixel, -box)) || any(greaterThan(pixel, size + box))) return;
 
-  vec3 colour = vec3(rg, bo.x);
-  if (shCount > 0) colour += harmonics(normalize(mean - position));
-  colour = max(colour, vec3(0.0));
-  float luma = dot(colour, vec3(0.299, 0.587, 0.114));
-  uvec3 code = texelFetch(codes, texel(textureSize(codes, 0).x, int(splat)), 0).xyz;
-  int k = int(code[level]);
-  vec4 label = texelFetch(table, ivec2(k, 2 * level), 0), answer = texelFetch(table, ivec2(k, 2 * level + 1), 0);
-  payload.a = opacity;
-  if (mode == ${MODES.depth}) payload.rgb = vec3(t.z, 0.0, 0.0);
-  else if (mode == ${MODES.unseen}) payload.rgb = unpackHalf2x16(b.z).y > 0.5 ? vec3(0.9, 0.1, 0.6) : vec3(0.15 + 0.7 * luma);
-  else if (mode == ${MODES.relevancy}) payload.rgb = vec3(luma, answer.xy);
+  vec4 shown = vec4(0.0, 0.0, 0.0, opacity);
+  if (mode == ${MODES.depth}) shown.r = t.z;
   else {
-    payload.rgb = mode == ${MODES.level} ? label.rgb : colour;
-    if (selecting == 1 && label.a < 0.5) payload.rgb = 0.3 * mix(vec3(dot(payload.rgb, vec3(0.299, 0.587, 0.114))), payload.rgb, 0.25);
+    vec3 colour = vec3(rg, bo.x);
+    if (shCount > 0) colour += harmonics(normalize(mean - position));
+    colour = max(colour, vec3(0.0));
+    float luma = dot(colour, GREY);
+    int k = int(texelFetch(codes, texel(textureSize(codes, 0).x, splat), 0)[level]);
+    vec4 label = texelFetch(table, ivec2(k, 2 * level), 0), answer = texelFetch(table, ivec2(k, 2 * level + 1), 0);
+    if (mode == ${MODES.unseen}) shown.rgb = s2u.y > 0.5 ? vec3(0.9, 0.1, 0.6) : vec3(0.15 + 0.7 * luma);
+    else if (mode == ${MODES.relevancy}) shown.rgb = vec3(luma, answer.xy);
+    else {
+      shown.rgb = mode == ${MODES.level} ? label.rgb : colour;
+      if (selecting == 1 && label.a < 0.5) shown.rgb = 0.3 * mix(vec3(dot(shown.rgb, GREY)), shown.rgb, 0.25);
+    }
   }
+  place = floatBitsToUint(vec4(pixel, along));
+  extent = uvec4(floatBitsToUint(vec3(deviations, reach)), 1u);
+  payload = floatBitsToUint(shown);
+}`;
+
+const VERTEX = `#version 300 es
+precision highp float; precision highp int; precision highp usampler2D;
+uniform usampler2D place, extent, payload;
+uniform vec2 size;
+uniform int lean;
+flat out vec4 value;  // blended values, opacity
+out vec2 offset;      // in standard deviations
+void main() {
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0); // nowhere
+  int i = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
+  ivec2 cell = ivec2(i % ${ROW}, i / ${ROW});
+  uvec4 e = texelFetch(extent, cell, 0);
+  if (e.w == 0u) return;
+  vec3 far = uintBitsToFloat(e.xyz);
+  vec4 p = uintBitsToFloat(texelFetch(place, cell, 0));
+  value = uintBitsToFloat(texelFetch(payload, cell, 0));
+  // Corners of the square about the circle of radius 1, or of the triangle: half the set-up, and
+  // a third more pixels, which are discarded.
+  int x = (gl_VertexID & 1) * 2 - 1, y = (gl_VertexID & 2) - 1;
+  offset = far.z * (lean == 0 ? vec2(x, y) : y < 0 ? vec2(1.7320508 * float(x), -1.0) : vec2(0.0, 2.0));
+  vec2 pixel = p.xy + offset.x * far.x * p.zw + offset.y * far.y * vec2(-p.w, p.z);
+  gl_Position = vec4(pixel.x / size.x * 2.0 - 1.0, 1.0 - pixel.y / size.y * 2.0, 0.0, 1.0);
 }`;
 
 const FRAGMENT = `#version 300 es
 precision highp float;
-flat in vec4 payload;
+flat in vec4 value;
 in vec2 offset;
 out vec4 blended;
 void main() {
-  float alpha = min(0.99, payload.a * exp(-0.5 * dot(offset, offset)));
+  float alpha = min(0.99, value.a * exp(-0.5 * dot(offset, offset)));
   if (alpha < 1.0 / 255.0) discard;
-  blended = vec4(payload.rgb * alpha, alpha);
+  blended = vec4(value.rgb * alpha, alpha);
 }`;
-
-const TRIANGLE = `#version 300 es
-void main() { gl_Position = vec4(vec2((gl_VertexID & 1) * 4 - 1, (gl_VertexID & 2) * 2 - 1), 0.0, 1.0); }`;
 
 // Colour maps of the report: src/report/colour.rs.
 const RESOLVE = `#version 300 es
-precision highp float;
+precision highp float; precision highp sampler2D;
 uniform sampler2D image;
-uniform int mode;
+uniform int mode, doubt;
 uniform vec2 range; // near and far depth
 out vec4 shown;
 
@@ -153,9 +198,9 @@ void main() {
   } else if (mode == ${MODES.relevancy}) {
     float alpha = max(v.a, 1e-6), heat = clamp((v.g / alpha - 0.5) * 2.0, 0.0, 1.0);
     vec3 base = vec3(0.25 + 0.5 * v.r / alpha);
-    shown.rgb = v.a * mix(base, turbo(0.45 + 0.5 * heat), 0.85 * heat);
+    shown.rgb = v.a * mix(base, doubt == 1 ? vec3(0.95) : turbo(0.45 + 0.5 * heat), (doubt == 1 ? 0.6 : 0.85) * heat);
     bool around = answers(p + ivec2(1, 0)) && answers(p - ivec2(1, 0)) && answers(p + ivec2(0, 1)) && answers(p - ivec2(0, 1));
-    if (answers(p) && !around) shown.rgb = vec3(1.0);
+    if (answers(p) && !around) shown.rgb = vec3(doubt == 1 ? 0.6 : 1.0);
   }
 }`;
 
@@ -186,9 +231,11 @@ export class Renderer {
     if (!gl) throw new Error("this browser offers no WebGL 2");
     this.gl = gl;
     // Without half floats the image is blended in bytes, with visible steps.
-    this.format = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float")
-      ? [gl.RGBA16F, gl.HALF_FLOAT] : [gl.RGBA8, gl.UNSIGNED_BYTE];
-    this.splat = program(gl, VERTEX, FRAGMENT);
+    const halves = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
+    this.coarse = [gl.RGBA8, gl.UNSIGNED_BYTE];
+    this.fine = halves ? [gl.RGBA16F, gl.HALF_FLOAT] : this.coarse;
+    this.project = program(gl, TRIANGLE, PROJECT);
+    this.quads = program(gl, VERTEX, FRAGMENT);
     this.resolve = program(gl, TRIANGLE, RESOLVE);
     this.upload(splats);
     this.levels = levels;
@@ -197,19 +244,34 @@ export class Renderer {
     levels.forEach((level, l) => [[0.13, 0.13, 0.13], ...level.colours].forEach((c, k) => this.table.set(c, 4 * (2 * l * this.columns + k))));
     this.textures.table = this.texture();
     this.sendTable();
-    this.order = gl.createBuffer();
     this.count = 0;
     this.range = [1, 2];
+    this.doubt = false;
+    const rows = Math.ceil(splats.count / ROW) || 1;
+    const store = (format) => {
+      const made = this.texture();
+      gl.texStorage2D(gl.TEXTURE_2D, 1, format, ROW, rows);
+      return made;
+    };
+    this.textures.order = store(gl.R32UI);
+    this.projected = { place: store(gl.RGBA32UI), extent: store(gl.RGBA32UI), payload: store(gl.RGBA32UI) };
+    this.projection = this.framebuffer(Object.values(this.projected));
     this.array = gl.createVertexArray();
     gl.bindVertexArray(this.array);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    // Two triangles per splat, and after those of a batch one.
+    const of = (corners) => Array.from({ length: BATCH }, (_, k) => corners.map((c) => 4 * k + c)).flat();
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, Uint16Array.from([...of([0, 1, 2, 2, 1, 3]), ...of([0, 1, 2])]), gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    this.target = gl.createFramebuffer();
-    this.image = this.texture();
-    this.size = [0, 0];
+    this.images = new Map();
+  }
+
+  framebuffer(textures) {
+    const { gl } = this, made = gl.createFramebuffer(), slots = textures.map((_, k) => gl.COLOR_ATTACHMENT0 + k);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, made);
+    textures.forEach((texture, k) => gl.framebufferTexture2D(gl.FRAMEBUFFER, slots[k], gl.TEXTURE_2D, texture, 0));
+    gl.drawBuffers(slots);
+    return made;
   }
 
   texture() {
@@ -276,8 +338,10 @@ export class Renderer {
     this.sendTable();
   }
 
-  /// Sets the relevancy per level and code, and the codes of `level` that answer.
-  answer(relevancy, level, codes) {
+  /// Sets the relevancy per level and code, and the codes of `level` that answer. An answer in
+  /// `doubt` is drawn without colours.
+  answer(relevancy, level, codes, doubt) {
+    this.doubt = doubt;
     relevancy.forEach((list, at) => list.forEach((v, k) => {
       this.table.set([v, at === level && codes.includes(k) ? 1 : 0], 4 * ((2 * at + 1) * this.columns + k + 1));
     }));
@@ -285,40 +349,52 @@ export class Renderer {
   }
 
   setOrder({ sorted, near, far }) {
-    const { gl } = this;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferData(gl.ARRAY_BUFFER, sorted, gl.DYNAMIC_DRAW);
+    const { gl } = this, rows = Math.floor(sorted.length / ROW), rest = sorted.length - rows * ROW;
+    const send = (y, width, height) =>
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, width, height, gl.RED_INTEGER, gl.UNSIGNED_INT, sorted, y * ROW);
+    gl.bindTexture(gl.TEXTURE_2D, this.textures.order);
+    if (rows) send(0, ROW, rows);
+    if (rest) send(rows, rest, 1);
     this.count = sorted.length;
     this.range = [near, far];
   }
 
-  resize(width, height) {
-    const { gl } = this;
-    if (this.size[0] === width && this.size[1] === height) return;
-    this.size = [width, height];
-    gl.bindTexture(gl.TEXTURE_2D, this.image);
-    gl.texImage2D(gl.TEXTURE_2D, 0, this.format[0], width, height, 0, gl.RGBA, this.format[1], null);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
-    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, this.image, 0);
+  /// Image of a format and size, with its framebuffer.
+  image(format, width, height) {
+    const { gl } = this, have = this.images.get(format);
+    if (have?.width === width && have.height === height) return have;
+    if (have) {
+      gl.deleteTexture(have.texture);
+      gl.deleteFramebuffer(have.frame);
+    }
+    const texture = this.texture();
+    gl.texImage2D(gl.TEXTURE_2D, 0, format[0], width, height, 0, gl.RGBA, format[1], null);
+    const made = { width, height, texture, frame: this.framebuffer([texture]) };
+    this.images.set(format, made);
+    return made;
   }
 
-  /// Draws the image of a camera at the size of the canvas.
-  draw(camera, { mode, level, selecting, near }) {
-    const { gl } = this, [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
-    this.resize(width, height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
-    gl.viewport(0, 0, width, height);
-    gl.clearColor(0, 0, 0, 0);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    const { made, at } = this.splat;
+  /// Uses a program with its textures; returns the locations of its uniforms.
+  use({ made, at }, textures) {
+    const { gl } = this;
     gl.useProgram(made);
-    ["data", "codes", "sh", "table"].forEach((name, slot) => {
+    Object.entries(textures).forEach(([name, texture], slot) => {
       gl.activeTexture(gl.TEXTURE0 + slot);
-      gl.bindTexture(gl.TEXTURE_2D, this.textures[name]);
+      gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform1i(at[name], slot);
     });
+    return at;
+  }
+
+  /// Draws the image of a camera at the size of the canvas. `guessed` is the opacity of what no
+  /// photo shows. `lean`, for moving pictures, omits harmonics, blends colours in bytes and draws
+  /// one triangle per splat.
+  draw(camera, { mode, level, selecting, near, guessed, lean }) {
+    const { gl } = this, [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    let at = this.use(this.project, this.textures);
     gl.uniform3fv(at.shScale, this.shScale);
-    gl.uniform1i(at.shCount, this.shCount);
+    gl.uniform1i(at.count, this.count);
+    gl.uniform1i(at.shCount, lean ? 0 : this.shCount);
     gl.uniform1i(at.antialiased, this.antialiased ? 1 : 0);
     gl.uniform1i(at.mode, MODES[mode]);
     gl.uniform1i(at.level, level);
@@ -329,20 +405,34 @@ export class Renderer {
     gl.uniform4fv(at.intrinsics, camera.intrinsics(width, height));
     gl.uniform2f(at.size, width, height);
     gl.uniform1f(at.near, near);
+    gl.uniform1f(at.guessed, guessed);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.projection);
+    gl.viewport(0, 0, ROW, Math.ceil(this.count / ROW));
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+
+    // Depths exceed the range of bytes, and heat shows their steps.
+    const bytes = lean && mode !== "depth" && mode !== "relevancy";
+    const image = this.image(bytes ? this.coarse : this.fine, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, image.frame);
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(0, 0, 0, 0);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    at = this.use(this.quads, this.projected);
+    gl.uniform2f(at.size, width, height);
+    gl.uniform1i(at.lean, lean ? 1 : 0);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.array);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);
+    const [corners, from] = lean ? [3, 2 * 6 * BATCH] : [6, 0];
+    gl.drawElementsInstanced(gl.TRIANGLES, corners * BATCH, gl.UNSIGNED_SHORT, from, Math.ceil(this.count / BATCH));
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
 
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.useProgram(this.resolve.made);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.image);
-    gl.uniform1i(this.resolve.at.image, 0);
-    gl.uniform1i(this.resolve.at.mode, MODES[mode]);
-    gl.uniform2fv(this.resolve.at.range, this.range);
+    at = this.use(this.resolve, { image: image.texture });
+    gl.uniform1i(at.mode, MODES[mode]);
+    gl.uniform1i(at.doubt, this.doubt ? 1 : 0);
+    gl.uniform2fv(at.range, this.range);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 }

@@ -1,6 +1,19 @@
 // Reader of the packed scene (format: src/report/viewer/pack.rs).
 const BLOCK = 256;
 
+/// Downloads the packed scene; `tell` gets the received share where the server sends the length.
+export async function download(url, tell) {
+  const reply = await fetch(url);
+  if (!reply.ok) throw new Error(`the scene is not there (${reply.status})`);
+  const length = Number(reply.headers.get("Content-Length")), reader = reply.body.getReader(), parts = [];
+  for (let got = 0, part; !(part = await reader.read()).done;) {
+    parts.push(part.value);
+    got += part.value.length;
+    if (length) tell(Math.min(1, got / length));
+  }
+  return new Blob(parts).arrayBuffer();
+}
+
 /// Inflates a gzip stream.
 export async function gunzip(buffer) {
   const stream = new Blob([buffer]).stream().pipeThrough(new DecompressionStream("gzip"));
@@ -17,6 +30,26 @@ export function half(value) {
   if (exponent > 142) return sign | 0x7bff;
   if (exponent < 113) return sign | (((mantissa | 0x800000) >>> (125 - exponent)) + 1) >>> 1;
   return sign + ((((exponent - 112) << 10) | (mantissa >>> 13)) + ((mantissa >>> 12) & 1));
+}
+
+/// Middle of the splats that photos show, the median per axis, and the radius about it that holds
+/// nine tenths of them.
+export function extentOf({ count, positions, unseen }) {
+  const seen = Uint32Array.from({ length: count }, (_, i) => i).filter((i) => !unseen?.[i]);
+  const quantile = (share, value) => Float32Array.from(seen, value).sort()[Math.floor(share * (seen.length - 1))] ?? 0;
+  const centre = [0, 1, 2].map((k) => quantile(0.5, (i) => positions[3 * i + k]));
+  const radius = quantile(0.9, (i) => Math.hypot(...centre.map((v, k) => positions[3 * i + k] - v)));
+  return { centre, radius: radius || 1 };
+}
+
+/// Median depth of the splats in front of a camera.
+export function medianDepth({ count, positions }, camera) {
+  const r = camera.rotation, t = camera.translation, z = [];
+  for (let i = 0; i < count; i += 7) {
+    const depth = r[6] * positions[3 * i] + r[7] * positions[3 * i + 1] + r[8] * positions[3 * i + 2] + t[2];
+    if (depth > 0) z.push(depth);
+  }
+  return z.sort((a, b) => a - b)[z.length >> 1] || 1;
 }
 
 /// Unpacks {count, degree, positions [N, 3], logScales [N, 3], quats [N, 4], packedQuats [N] as in

@@ -1,10 +1,13 @@
 // Page of the viewer: connects canvas, controls and scene. All data are in the page (#v-manifest),
 // or come from the server that sent it.
-import { Camera, add, scale, upOf } from "splatvk/camera";
-import { Tape } from "splatvk/measure";
+import { Camera, upOf } from "splatvk/camera";
+import { button, controls, fullScreen } from "splatvk/controls";
+import { Tape, lengthText } from "splatvk/measure";
+import { MOST, Motion, Pace, firstCamera } from "splatvk/motion";
+import { isClear, namesOf, perhaps } from "splatvk/names";
 import { pick } from "splatvk/pick";
 import { Renderer } from "splatvk/render";
-import { gunzip, unpack } from "splatvk/splats";
+import { download, extentOf, gunzip, medianDepth, unpack } from "splatvk/splats";
 
 const manifest = JSON.parse(document.getElementById("v-manifest").textContent);
 const root = document.querySelector(".viewer");
@@ -13,20 +16,26 @@ const canvas = find("canvas");
 const { views, levels } = manifest;
 const up = manifest.up || upOf(views);
 
-const state = { mode: "colour", level: levels.findLastIndex((l) => l.colours.length), selected: null, picked: null, query: null };
-let splats, renderer, camera, worker, near = 0.01;
-let request = 0, sortedFor = -1, waiting = false, drawn = true, flight = null, walking = new Set();
-const idle = [];
+const state = { mode: "colour", level: levels.findLastIndex((l) => l.colours.length), selected: null, picked: null, query: null, guessed: false };
+const STALE = 0, ROUGH = 1, SHARP = 2;
+let splats, extent, renderer, motion, worker, near = 0.01;
+let request = 0, sortedFor = -1, waiting = false, drawn = STALE, capturing = false;
+const idle = [], pace = new Pace();
 const tape = new Tape(find(".v-tape"), find(".v-line"), manifest.metres, say);
 
 // --- scene --------------------------------------------------------------------------------------
 
 async function load() {
-  const inline = document.getElementById("v-splats");
-  const packed = inline ? Uint8Array.from(atob(inline.textContent.trim()), (c) => c.charCodeAt(0)).buffer
-    : await (await fetch(manifest.scene)).arrayBuffer();
+  const inline = document.getElementById("v-splats"), wait = find(".v-wait");
+  if (inline) {
+    wait.textContent = "Unpacking …";
+    await new Promise((go) => requestAnimationFrame(() => setTimeout(go)));
+  }
+  const packed = inline ? Uint8Array.from(atob(inline.textContent.trim()), (c) => c.charCodeAt(0))
+    : await download(manifest.scene, (share) => { wait.textContent = `Loading the scene … ${Math.floor(100 * share)} %`; });
   splats = unpack(await gunzip(packed));
   inline?.remove();
+  extent = extentOf(splats);
   renderer = new Renderer(canvas, splats, levels);
   canvas.addEventListener("webglcontextlost", (e) => e.preventDefault());
   canvas.addEventListener("webglcontextrestored", restore);
@@ -36,16 +45,19 @@ async function load() {
     renderer.setOrder(data);
     sortedFor = data.id;
     waiting = false;
-    drawn = false;
+    drawn = STALE;
     if (request !== sortedFor) sort();
   };
   worker.postMessage({ positions: splats.positions.slice() });
-  camera = views.length ? Camera.of(views[0], 1) : overview();
-  near = 0.01 * medianDepth(camera);
-  camera.distance = 100 * near;
-  aimAt(camera);
-  find(".v-wait").remove();
-  new ResizeObserver(moved).observe(canvas);
+  const home = firstCamera(views, extent, manifest.up);
+  near = 0.01 * medianDepth(splats, home);
+  home.distance = 100 * near;
+  aimAt(home);
+  // A tenth of the usual depth: nearer, a single surface fills the picture.
+  motion = new Motion({ home, views, up, closest: 10 * near }, { aim: aimAt, moved, shown: markPhoto, playing });
+  wait.remove();
+  new ResizeObserver(resized).observe(canvas);
+  new IntersectionObserver(([entry]) => { motion.onScreen = entry.isIntersecting; }).observe(canvas);
   moved();
   requestAnimationFrame(frame);
   if (root.classList.contains("full")) root.focus();
@@ -55,31 +67,13 @@ async function load() {
 function restore() {
   renderer = new Renderer(canvas, splats, levels);
   if (state.selected) renderer.select(state.selected.level, state.selected.codes);
-  if (state.query) renderer.answer(state.query.relevancy, state.query.level, state.query.codes);
+  if (state.query) highlight(state.query);
   moved();
-}
-
-/// Camera for a scene without photos: outside, so that the central splats fill the picture.
-function overview() {
-  const sorted = [0, 1, 2].map((k) => Float32Array.from({ length: splats.count }, (_, i) => splats.positions[3 * i + k]).sort());
-  const at = (share) => sorted.map((axis) => axis[Math.floor(share * (axis.length - 1))]);
-  const size = Math.hypot(...at(0.9).map((v, k) => v - at(0.1)[k]));
-  const rotation = [1, 0, 0, 0, 1, 0, 0, 0, 1];
-  return new Camera({ rotation, position: add(at(0.5), scale([0, 0, 1], -1.2 * size)), focal: 1.2, distance: 1.2 * size });
-}
-
-function medianDepth(from) {
-  const r = from.rotation, t = from.translation, z = [];
-  for (let i = 0; i < splats.count; i += 7) {
-    const depth = r[6] * splats.positions[3 * i] + r[7] * splats.positions[3 * i + 1] + r[8] * splats.positions[3 * i + 2] + t[2];
-    if (depth > 0) z.push(depth);
-  }
-  return z.sort((a, b) => a - b)[z.length >> 1] || 1;
 }
 
 /// Sets the pivot of a camera to the surface in the middle of its image.
 function aimAt(which) {
-  const hit = pick(splats, which, 320, 240, 640, 480, near);
+  const hit = pick(splats, which, 320, 240, 640, 480, near, showsGuessed());
   if (hit) which.distance = hit.depth;
 }
 
@@ -89,143 +83,100 @@ function fit(width, height) {
   if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
 }
 
-function fitToPage() {
-  // More than two device pixels per CSS pixel cost power without a visible difference.
-  const ratio = Math.min(devicePixelRatio || 1, 2);
-  fit(Math.max(1, Math.round(canvas.clientWidth * ratio)), Math.max(1, Math.round(canvas.clientHeight * ratio)));
-}
+/// Size of the picture in CSS pixels, or of one that is captured.
+const size = () => (capturing ? [canvas.width, canvas.height] : [canvas.clientWidth, canvas.clientHeight]);
 
 function sort() {
   if (waiting) return;
   waiting = true;
-  const [fx, fy, cx, cy] = camera.intrinsics(canvas.width, canvas.height);
+  const { camera } = motion, [width, height] = size(), [fx, fy, cx, cy] = camera.intrinsics(width, height);
   // Half an image more on every side, since splats reach beyond their centre.
-  const slope = [(Math.max(cx, canvas.width - cx) + canvas.width / 2) / fx, (Math.max(cy, canvas.height - cy) + canvas.height / 2) / fy];
+  const slope = [(Math.max(cx, width - cx) + width / 2) / fx, (Math.max(cy, height - cy) + height / 2) / fy];
   worker.postMessage({ id: request, rotation: camera.rotation, translation: camera.translation, near, slope });
 }
 
 /// Redraws after a change of the camera or of the size of the picture.
 function moved() {
-  if (!capturing) fitToPage();
   request++;
-  drawn = false;
+  drawn = STALE;
   sort();
 }
 
+function resized() {
+  makeRoom();
+  moved();
+}
+
 function changed() {
-  drawn = false;
+  drawn = STALE;
 }
 
-function draw() {
-  if (!capturing) tape.draw(camera, canvas.clientWidth, canvas.clientHeight, near);
-  renderer.draw(camera, { mode: state.mode, level: state.level, selecting: state.selected !== null, near });
+/// Whether what no photo shows is in the picture: in colour it is a grey veil over the rest.
+const showsGuessed = () => state.guessed || state.mode !== "colour";
+
+function draw(camera, lean = false) {
+  const { mode, level, selected } = state;
+  renderer.draw(camera, { mode, level, selecting: selected !== null, near, guessed: showsGuessed() ? 1 : 0, lean });
 }
 
-let last = 0;
+let last = 0, slowest = 0, wasRough = false;
 function frame(now) {
-  const seconds = Math.min((now - last) / 1000, 0.1);
-  last = now;
-  if (!capturing) {
-    if (flight) fly(now);
-    if (walking.size) walk(seconds);
-    if (!drawn) {
-      draw();
-      drawn = true;
-    }
-    if (request === sortedFor && !flight && drawn) idle.splice(0).forEach((tell) => tell());
-  }
   requestAnimationFrame(frame);
+  if (capturing) return;
+  motion.step(now);
+  // A frame that takes long delays one of the next calls, not always the very next.
+  slowest = Math.max(slowest, now - last);
+  last = now;
+  const rough = motion.moving(now);
+  if (rough ? drawn === STALE : drawn !== SHARP && request === sortedFor) {
+    if (rough && wasRough) pace.note(slowest);
+    slowest = 0;
+    // Where frames are slow, a sharp picture is the better greeting.
+    if (pace.lean) motion.rest();
+    tape.draw(motion.camera, ...size(), near);
+    legend();
+    const most = Math.min(devicePixelRatio || 1, MOST), density = rough ? Math.min(most, pace.density) : most;
+    fit(...size().map((v) => Math.max(1, Math.round(v * density))));
+    draw(motion.camera, rough && pace.lean);
+    drawn = rough ? ROUGH : SHARP;
+    wasRough = rough;
+  }
+  if (drawn === SHARP && !rough && !input?.pending()) idle.splice(0).forEach((tell) => tell());
 }
 
-/// Resolves when the picture shows the current state, splats in their final order.
-const settled = () => new Promise((tell) => idle.push(tell));
-
-let capturing = false;
+/// Resolves when the picture shows the current state in full quality, splats in their final order.
+function settled() {
+  motion.rest();
+  return new Promise((tell) => idle.push(tell));
+}
 
 /// Returns the picture as a PNG blob; with the index of a photo, from its camera at its size.
 async function picture(view) {
   await settled();
-  const before = camera;
+  const before = motion.camera;
   capturing = true;
   try {
     if (view !== undefined) {
-      camera = Camera.of(views[view], 1);
+      motion.camera = Camera.of(views[view], 1);
       fit(views[view].width, views[view].height);
       moved();
       while (request !== sortedFor) await new Promise((go) => setTimeout(go, 5));
     }
-    draw();
+    draw(motion.camera);
     return await new Promise((done) => canvas.toBlob(done));
   } finally {
     capturing = false;
-    camera = before;
+    motion.camera = before;
     moved();
   }
 }
 
-// --- cameras ------------------------------------------------------------------------------------
-
-const SECONDS_PER_LEG = 1.6;
-const ease = (t) => t * t * (3 - 2 * t);
-const still = matchMedia("(prefers-reduced-motion: reduce)");
-
-function goTo(index, jump = false) {
-  const to = Camera.of(views[index], camera.distance);
-  aimAt(to);
-  flight = null;
-  if (jump || still.matches) {
-    camera = to;
-    moved();
-  } else flight = { legs: [camera.copy(), to], at: performance.now(), views: [index] };
-  current(index);
-}
-
-/// Moves through the cameras of all photos in a loop, from the present camera.
-function play() {
-  if (flight) return stop();
-  if (!views.length) return;
-  const stops = views.map((v) => Camera.of(v, camera.distance));
-  stops.forEach(aimAt);
-  flight = { legs: [camera.copy(), ...stops], at: performance.now(), views: views.map((_, i) => i), round: true };
-  find("[data-do=play]").setAttribute("aria-pressed", "true");
-}
-
-function stop() {
-  flight = null;
-  find("[data-do=play]").setAttribute("aria-pressed", "false");
-}
-
-function fly(now) {
-  const { legs, at, views: indices, round } = flight;
-  const t = Math.max(0, now - at) / 1000 / SECONDS_PER_LEG, leg = Math.floor(t);
-  if (leg >= legs.length - 1) {
-    camera = legs[legs.length - 1].copy();
-    if (round) {
-      flight = { ...flight, legs: [camera.copy(), ...legs.slice(1)], at: now };
-    } else stop();
-  } else {
-    camera = Camera.between(legs[leg], legs[leg + 1], ease(t - leg));
-    current(indices[leg]);
-  }
-  moved();
-}
-
-function current(index) {
+function markPhoto(index) {
   find(".v-photos").querySelectorAll("button").forEach((b, i) => b.setAttribute("aria-current", String(i === index)));
 }
 
-function turn(change) {
-  stop();
-  current(-1);
-  change();
-  moved();
-}
-
-function walk(seconds) {
-  const step = 0.6 * camera.distance * seconds;
-  const has = (key) => (walking.has(key) ? 1 : 0);
-  const [x, y, z] = [has("d") - has("a"), has("q") - has("e"), has("w") - has("s")];
-  turn(() => camera.move(x * step, y * step, z * step));
+function playing(on) {
+  find("[data-do=play]").setAttribute("aria-pressed", String(on));
 }
 
 // --- display ------------------------------------------------------------------------------------
@@ -248,7 +199,7 @@ function show(mode, level = state.level) {
   const at = modes.findIndex((m) => m.mode === mode && (mode !== "level" || m.level === level));
   find(".v-modes").querySelectorAll("button").forEach((b, i) => {
     b.setAttribute("aria-checked", String(i === at));
-    if (i === at) b.scrollIntoView({ block: "nearest", inline: "nearest" });
+    b.tabIndex = i === at ? 0 : -1;
   });
   if (mode === "level" && state.picked && state.picked.codes[level] >= 0) select(level, state.picked);
   changed();
@@ -262,24 +213,20 @@ function select(level, picked) {
   if (state.mode !== "level") state.mode = "colour";
   renderer.select(level, [code]);
   show(state.mode, level);
-  const names = namesOf(level, code), size = `${sizeOf(level, code).toLocaleString("en")} splats`;
-  if (names.length) card(names[0][0], `${levels[level].one} · ${size}`, picked, level, names);
-  else card(levels[level].one, `${size}. ${manifest.names_note}`, picked, level, names);
+  const names = namesOf(levels, answers, level, code), size = `${sizeOf(level, code).toLocaleString("en")} splats`;
+  const { one } = levels[level], asked = answers.find((a) => isSure(a) && a.level === level && a.codes.includes(code));
+  if (asked || isClear(names)) card(asked?.text ?? names[0][0], `${one} · ${size}`, { picked, level, names });
+  else card(one, names.length ? size : `${size}. ${manifest.names_note}`, { picked, level, doubt: perhaps(names) });
 }
 
-/// Phrases that fit a code best, of the text model and of the queries so far. At 0.5 and below, a
-/// phrase fits no better than "object" or "stuff".
-function namesOf(level, code) {
-  const all = new Map(levels[level].phrases[code] || []);
-  answers.forEach((a) => all.set(a.text, a.relevancy[level][code]));
-  return [...all].filter((name) => name[1] > 0.51).sort((a, b) => b[1] - a[1]).slice(0, 6);
-}
-
-function card(title, note, picked, level, names) {
+/// Shows the card of a selection or an answer. `names` are listed with their relevancy; `doubt` is
+/// a line of what it may be.
+function card(title, note, { picked, level, names = [], doubt = "" }) {
   const box = find(".v-card");
   box.hidden = false;
   box.querySelector("h3").textContent = title;
   box.querySelector(".v-note").textContent = note;
+  box.querySelector(".v-doubt").textContent = doubt && `perhaps ${doubt}`;
   box.querySelector(".v-levels").replaceChildren(...(picked ? levels.flatMap((l, at) => {
     if (picked.codes[at] < 0) return [];
     return [button(l.one, () => select(at, picked), { "aria-pressed": String(at === level) })];
@@ -291,16 +238,62 @@ function card(title, note, picked, level, names) {
     item.append(name, value, bar);
     return item;
   }));
+  makeRoom();
+}
+
+function fold() {
+  const folded = find(".v-card").classList.toggle("folded");
+  find(".v-fold").setAttribute("aria-expanded", String(!folded));
+  makeRoom();
+}
+
+/// Middle of the splats of some codes in view, in shares of the picture without its offset; null
+/// without any.
+function middleOf({ level, codes }) {
+  const [width, height] = size();
+  let sum = [0, 0], n = 0;
+  splats.codes[level].forEach((code, i) => {
+    if (!codes.includes(code - 1)) return;
+    const [x, y, z] = motion.camera.project(splats.positions.subarray(3 * i, 3 * i + 3), width, height);
+    if (z < near || x < 0 || y < 0 || x > width || y > height) return;
+    sum = [sum[0] + x / width, sum[1] + y / height];
+    n++;
+  });
+  return n ? sum.map((v, k) => v / n - motion.inset[k]) : null;
+}
+
+/// On a small screen, moves the image centre so that the card does not cover the selection.
+function makeRoom() {
+  const box = find(".v-card"), chosen = state.selected ?? state.query;
+  const [all, own] = [root.getBoundingClientRect(), box.getBoundingClientRect()];
+  const small = all.width <= 720 || all.height < 420;
+  const middle = small && chosen && !box.hidden && !box.classList.contains("folded") && middleOf(chosen);
+  const sheet = own.width > 0.8 * all.width;
+  const covered = sheet ? (all.bottom - own.top) / all.height : (all.right - own.left) / all.width;
+  // Along the other axis, into the middle of the picture.
+  const off = ([x, y]) => [Math.min(covered, Math.max(0, x - (1 - covered) / 2)), y - Math.min(0.7, Math.max(0.3, y))];
+  const [by, aside] = middle ? off(sheet ? [...middle].reverse() : middle) : [0, 0];
+  motion.insetTo = sheet ? [-aside, -by] : [-by, -aside];
+}
+
+/// Shows the scale of the colours of depth and relevancy.
+function legend() {
+  const box = find(".v-legend"), { mode, query } = state;
+  box.hidden = mode !== "depth" && mode !== "relevancy";
+  if (box.hidden) return;
+  box.className = `v-legend ${mode === "depth" || isSure(query) ? mode : "doubt"}`;
+  const ends = mode === "depth" ? renderer.range.map((z) => lengthText(Number(z.toPrecision(2)), tape.metres)) : ["not at all", "exactly"];
+  box.querySelectorAll("span").forEach((span, k) => { span.textContent = ends[k]; });
 }
 
 function clear() {
   state.selected = state.picked = null;
   renderer.select(-1, []);
   find(".v-card").hidden = true;
-  find(".v-help").hidden = true;
   if (tape.active) measure(false);
   setQuery(null);
   if (state.mode === "relevancy") show("colour");
+  makeRoom();
   changed();
 }
 
@@ -333,10 +326,17 @@ async function ask(text) {
   show("relevancy");
 }
 
+/// Whether an answer says that the thing is there.
+const isSure = (answer) => answer.found > 0 && answer.presence !== "unsure";
+
+function highlight(answer) {
+  renderer.answer(answer.relevancy, answer.level, answer.codes, !isSure(answer));
+}
+
 function setQuery(answer) {
   state.query = answer;
   if (answer) {
-    renderer.answer(answer.relevancy, answer.level, answer.codes);
+    highlight(answer);
     find(".v-ask input").value = answer.text;
     const of = (k) => answer.relevancy[answer.level][k];
     const best = answer.codes.reduce((a, b) => (of(b) > of(a) ? b : a), answer.codes[0]);
@@ -346,8 +346,9 @@ function setQuery(answer) {
       : (answer.presence === "unsure" ? `Unsure; if it is here, ${where}` : `Found ${where}`) + as;
     const notes = (answer.notes ?? []).map((note) => `; ${note}`).join("");
     const time = answer.milliseconds === undefined ? "" : `, ${answer.milliseconds.toFixed(0)} ms`;
-    const names = best === undefined ? [] : namesOf(answer.level, best);
-    card(answer.text, `${found}${notes}${time}`, null, answer.level, names);
+    const names = best === undefined ? [] : namesOf(levels, answers, answer.level, best);
+    const others = names.filter(([phrase]) => phrase !== answer.text);
+    card(answer.text, `${found}${notes}${time}`, isSure(answer) ? { names } : { doubt: perhaps(others) });
   }
   find(".v-chips").querySelectorAll("button").forEach((b) => b.setAttribute("aria-pressed", String(b.textContent === answer?.text)));
 }
@@ -369,12 +370,6 @@ function say(text) {
 
 // --- controls -----------------------------------------------------------------------------------
 
-function button(text, act, attributes = {}) {
-  const made = Object.assign(document.createElement("button"), { type: "button", textContent: text, onclick: act });
-  Object.entries(attributes).forEach(([name, value]) => made.setAttribute(name, value));
-  return made;
-}
-
 const sizeOf = (level, code) => splats.codes[level].reduce((n, c) => n + (c === code + 1), 0);
 
 /// Level of a click: the coarsest level with a code at this position. A code with a quarter of the
@@ -385,13 +380,24 @@ function levelOf(codes) {
   return thing >= 0 ? thing : codes.findLastIndex((code) => code >= 0);
 }
 
-/// Selects the code at a position of the canvas, CSS pixels.
-function clickAt(x, y, centre = false) {
-  const ratio = canvas.width / canvas.clientWidth;
-  const hit = pick(splats, camera, x * ratio, y * ratio, canvas.width, canvas.height, near);
-  if (tape.active && !centre) return hit ? measureAt(x, y, hit.depth) : say("Nothing to measure to there.");
+/// Depth and codes at a position of the canvas, CSS pixels.
+function hitAt(x, y) {
+  return pick(splats, motion.camera, x, y, ...size(), near, showsGuessed());
+}
+
+const placeAt = (x, y, depth) => motion.camera.unproject(x, y, depth, ...size());
+
+/// The point of the scene at a position; where nothing is, one at the distance of the pivot.
+function surface(x, y) {
+  return placeAt(x, y, hitAt(x, y)?.depth ?? Math.max(motion.camera.distance, 2 * motion.closest));
+}
+
+/// Selects the code at a position, measures to it, or makes it the centre of turning.
+function tap(x, y, centre) {
+  const hit = hitAt(x, y);
+  if (centre) return hit && motion.turn((camera) => camera.aim(placeAt(x, y, hit.depth)));
+  if (tape.active) return hit ? measureAt(x, y, hit.depth) : say("Nothing to measure to there.");
   if (!hit) return clear();
-  if (centre) return turn(() => camera.aim(camera.unproject(x * ratio, y * ratio, hit.depth, canvas.width, canvas.height)));
   const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : levelOf(hit.codes);
   if (level < 0) return say("Nothing that the scene has words for.");
   setQuery(null);
@@ -399,7 +405,7 @@ function clickAt(x, y, centre = false) {
 }
 
 function measureAt(x, y, depth) {
-  tape.place(camera.unproject(x, y, depth, canvas.clientWidth, canvas.clientHeight));
+  tape.place(placeAt(x, y, depth));
   changed();
 }
 
@@ -407,58 +413,6 @@ function measure(on) {
   tape.toggle(on);
   find("[data-do=measure]").setAttribute("aria-pressed", String(tape.active));
   changed();
-}
-
-function pointers() {
-  const down = new Map();
-  let start = null, lastTap = null;
-  const middle = () => {
-    const all = [...down.values()];
-    const sum = all.reduce((s, p) => [s[0] + p[0] / all.length, s[1] + p[1] / all.length], [0, 0]);
-    const spread = all.length > 1 ? Math.hypot(all[0][0] - all[1][0], all[0][1] - all[1][1]) : 0;
-    return [...sum, spread];
-  };
-  canvas.addEventListener("pointerdown", (e) => {
-    root.focus({ preventScroll: true });
-    canvas.setPointerCapture(e.pointerId);
-    down.set(e.pointerId, [e.offsetX, e.offsetY]);
-    start = down.size === 1 ? [e.offsetX, e.offsetY] : null;
-  });
-  canvas.addEventListener("pointermove", (e) => {
-    if (!down.has(e.pointerId)) return;
-    const [x0, y0, spread0] = middle();
-    down.set(e.pointerId, [e.offsetX, e.offsetY]);
-    const [x, y, spread] = middle();
-    if (start && Math.hypot(e.offsetX - start[0], e.offsetY - start[1]) > 4) start = null;
-    if (start) return;
-    const [dx, dy] = [x - x0, y - y0], height = canvas.clientHeight;
-    turn(() => {
-      if (down.size > 1 || e.buttons === 2 || e.shiftKey) {
-        const step = camera.distance / camera.focal / height;
-        camera.move(-dx * step, -dy * step, 0);
-        if (spread0 > 0 && spread > 0) camera.dolly(spread0 / spread);
-      } else camera.orbit(-dx * 3 / height, dy * 3 / height, up);
-    });
-  });
-  const release = (e) => {
-    down.delete(e.pointerId);
-    // A press without movement is a click; a second one there soon after, a double click.
-    if (e.type === "pointerup" && start && e.button === 0) {
-      const again = lastTap && e.timeStamp - lastTap[2] < 350 && Math.hypot(start[0] - lastTap[0], start[1] - lastTap[1]) < 12;
-      clickAt(start[0], start[1], again);
-      lastTap = [start[0], start[1], e.timeStamp];
-    }
-    start = null;
-  };
-  canvas.addEventListener("pointerup", release);
-  canvas.addEventListener("pointercancel", release);
-  canvas.addEventListener("contextmenu", (e) => e.preventDefault());
-  canvas.addEventListener("wheel", (e) => {
-    // In a longer page the wheel scrolls until the view has been clicked.
-    if (!root.classList.contains("full") && !root.contains(document.activeElement)) return;
-    e.preventDefault();
-    turn(() => camera.dolly(Math.exp(Math.max(-0.3, Math.min(0.3, e.deltaY * (e.deltaMode ? 0.05 : 0.0015))))));
-  }, { passive: false });
 }
 
 async function save() {
@@ -469,78 +423,65 @@ async function save() {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
-function full() {
-  root.classList.toggle("full");
-  moved();
-}
-
-const actions = { play, save, full, measure: () => measure(), help: () => { find(".v-help").hidden = !find(".v-help").hidden; } };
-
-function keys() {
-  const arrows = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
-  root.addEventListener("keydown", (e) => {
-    if (e.target.tagName === "INPUT") {
-      if (e.key === "Escape") root.focus();
-      return;
-    }
-    if (e.ctrlKey || e.metaKey || e.altKey) return;
-    const key = e.key.toLowerCase();
-    if (arrows[e.key]) {
-      const [x, y] = arrows[e.key], step = 0.05 * camera.distance;
-      turn(() => (e.shiftKey ? camera.move(x * step, y * step, 0) : camera.orbit(x * 0.06, -y * 0.06, up)));
-    } else if (key >= "1" && key <= "9" && views[key - 1]) goTo(key - 1);
-    else if ("wasdqe".includes(key)) walking.add(key);
-    else if (key === "+" || key === "=") turn(() => camera.dolly(0.9));
-    else if (key === "-") turn(() => camera.dolly(1 / 0.9));
-    else if (key === " " && e.target === root) play();
-    else if (key === "m") nextMode();
-    else if (key === "l") measure();
-    else if (key === "p") save();
-    else if (key === "f") full();
-    else if (key === "?" || key === "h") actions.help();
-    else if (key === "/") find(".v-ask input").focus();
-    else if (key === "escape") clear();
-    else return;
-    e.preventDefault();
-  });
-  root.addEventListener("keyup", (e) => walking.delete(e.key.toLowerCase()));
-  root.addEventListener("blur", () => walking.clear());
-}
-
-function nextMode() {
+function nextMode(step) {
   const at = modes.findIndex((m) => m.mode === state.mode && (m.mode !== "level" || m.level === state.level));
-  const next = modes.slice(at + 1).concat(modes).find((m) => m.mode !== "relevancy" || state.query);
+  const around = modes.map((_, k) => modes[(at + step * (k + 1) + modes.length * modes.length) % modes.length]);
+  const next = around.find((m) => m.mode !== "relevancy" || state.query);
   show(next.mode, next.level);
 }
 
-function controls() {
-  find(".v-modes").replaceChildren(...modes.map((m) => button(m.name, () => show(m.mode, m.level), { role: "radio", title: m.title ?? "", "aria-checked": String(m.mode === "colour") })));
+function toggleGuessed() {
+  state.guessed = !state.guessed;
+  say(state.guessed ? "What no photo shows is shown as guessed." : "What no photo shows is hidden.");
+  changed();
+}
+
+/// Shows all that the photos show, from the present direction.
+function all() {
+  const to = motion.camera.copy();
+  to.frame(extent.centre, extent.radius);
+  motion.goTo(to, -1);
+}
+
+const actions = {
+  save, all,
+  play: () => motion.play(),
+  reset: () => motion.goTo(motion.home.copy(), -1),
+  full: () => fullScreen(root),
+  measure: () => measure(),
+  help: () => find(".v-help").showModal(),
+};
+
+let input;
+function connect() {
+  find(".v-modes").replaceChildren(...modes.map((m) => button(m.name, () => show(m.mode, m.level), { role: "radio", title: m.title ?? "" })));
+  show("colour");
   find(".v-photos").replaceChildren(...views.map((v, i) => {
-    const made = button(v.thumbnail ? "" : String(i + 1), () => goTo(i), { title: v.name, "aria-label": `photo ${v.name}` });
+    const made = button(v.thumbnail ? "" : String(i + 1), () => motion.goToView(i), { title: v.name, "aria-label": `photo ${v.name}` });
     if (v.thumbnail) made.style.backgroundImage = `url(${v.thumbnail})`;
     return made;
   }));
-  root.querySelectorAll("[data-do]").forEach((b) => { b.onclick = actions[b.dataset.do]; });
-  find(".v-close").onclick = clear;
+  find(".v-card .v-close").onclick = clear;
+  find(".v-fold").onclick = fold;
   const form = find(".v-ask");
   form.onsubmit = (e) => {
     e.preventDefault();
     ask(form.elements.text.value);
   };
-  if (!levels.some((l) => l.colours.length)) find(".v-top").hidden = true;
+  form.hidden = find(".v-chips").hidden = !levels.some((l) => l.colours.length);
   form.elements.text.placeholder = manifest.live ? "Ask for something you see" : "Queries of the run";
   listQueries();
-  pointers();
-  keys();
+  const fills = () => document.fullscreenElement === root || root.matches(".full, .wide");
+  input = controls({ root, canvas, motion, actions, tap, tapsAtOnce: () => tape.active, surface, fills, nextMode, toggleGuessed, clear });
 }
 
 /// Interface for scripts and tests, `splatvk` in the console.
 window.splatvk = {
-  ready: load().then(controls),
+  ready: load().then(connect),
   state,
-  camera: () => camera,
+  camera: () => motion.camera,
   tape,
-  goTo: (view) => (goTo(view, true), settled()),
+  goTo: (view) => (motion.goToView(view, true), settled()),
   show: (mode, level) => (show(mode, level), settled()),
   ask: async (text) => (await ask(text), settled()),
   settled,
