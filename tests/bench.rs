@@ -59,7 +59,14 @@ fn bench_training_times_add_up() {
     let back = ["regularisers", "raster backward", "projection backward", "Adam"];
     check_step(colour, &[forward.as_slice(), &back].concat());
     let features = bench.report.section("training step, 5 features").unwrap();
-    let back = ["feature loss", "raster backward", "projection backward", "Adam", "feature backward"];
+    let back = [
+        "regularisers",
+        "feature loss",
+        "raster backward",
+        "projection backward",
+        "Adam",
+        "feature backward",
+    ];
     check_step(features, &[forward.as_slice(), &back].concat());
     let steps = [colour, features].map(|s| s.row("training step").unwrap().ms.median);
     let ratio = features.value("step / step on colour alone").unwrap();
@@ -82,8 +89,14 @@ fn bench_measures_fused_update() {
     bench.training(&Workload::seeded(400, 75, 53, 1, 0).unwrap(), 5).unwrap();
     let forward = ["projection", "depth sort", "binning", "raster forward", "SSIM + L1"];
     let colour = ["regularisers", "raster backward", "projection backward + Adam"];
-    let features =
-        ["feature loss", "raster backward", "projection backward + Adam", "feature backward", "Adam"];
+    let features = [
+        "regularisers",
+        "feature loss",
+        "raster backward",
+        "projection backward + Adam",
+        "feature backward",
+        "Adam",
+    ];
     for (name, back) in [("training step", &colour[..]), ("training step, 5 features", &features)] {
         check_step(bench.report.section(name).unwrap(), &[forward.as_slice(), back].concat());
     }

@@ -121,5 +121,5 @@ fn eval_writes_all_or_nothing() {
     let mut names: Vec<_> = std::fs::read_dir(&out).unwrap().map(|e| e.unwrap().file_name()).collect();
     names.sort();
     assert_eq!(names, ["eval.json", "renders"]);
-    assert_eq!(std::fs::read_dir(out.join("renders")).unwrap().count(), 12);
+    assert_eq!(std::fs::read_dir(out.join("renders")).unwrap().count(), 18);
 }

@@ -73,7 +73,7 @@ fn evaluation_scores_perfect_scene_perfectly() {
     for FrameShown { psnr, psnr_white, score, .. } in &report.shown {
         assert!(*psnr > 60.0 && psnr == psnr_white, "{psnr} {psnr_white}");
         assert!(
-            score.alpha_below_99 == 0.0 && score.transparent == 0.0 && score.confetti < 2e-3,
+            score.alpha_below_99 == 0.0 && score.transparent == 0.0 && score.confetti < 0.01,
             "{score:?}"
         );
     }

@@ -535,7 +535,7 @@ fn ground_truth_serves_lerf_and_ovs() {
     };
     for (kind, figure) in [(ProtocolKind::Lerf, "localisation"), (ProtocolKind::Ovs, "accuracy_argmax")] {
         let mut protocol = open(kind, folder, &scene, &[]).unwrap();
-        assert_eq!(protocol.views().len(), 12);
+        assert_eq!(protocol.views().len(), 18);
         let queries: Vec<TextQuery> = protocol.prompts().iter().map(ask).collect();
         let scores = CodeScores::new(&field, &queries).unwrap();
         protocol.add(0, &DecodedView { codes: &codes, scores: &scores }).unwrap();
