@@ -6,14 +6,16 @@ use crate::eval::ShownScore;
 use crate::format::picture;
 use crate::photo::VideoWriter;
 use crate::progress::Progress;
-use crate::run::path::{CameraPath, FRAMES_PER_SEGMENT, PathViews, sheet};
+use crate::run::path::{CameraPath, FRAMES_PER_SEGMENT, PathViews, fitted, sheet};
 use crate::run::view::{DecodedFrame, Viewer};
 use crate::scene::{Camera, RgbImage};
 use serde::Serialize;
 use std::fmt::Write;
 
-/// Largest view in the sheet, pixels.
-const CELL: [usize; 2] = [400, 400];
+/// Longer side of a view in the sheet, pixels.
+const CELL: f64 = 400.0;
+/// File of the sheet.
+const SHEET: &str = "sheet.png";
 
 impl From<PathKind> for CameraPath {
     fn from(kind: PathKind) -> CameraPath {
@@ -36,31 +38,36 @@ struct ViewRow {
 pub struct PathOutput {
     path: CameraPath,
     views: PathViews,
+    cameras: Vec<Camera>,
+    /// Size of a view in the sheet, pixels.
+    cell: [usize; 2],
+    /// The views at that size.
     images: Vec<RgbImage>,
     rows: Vec<ViewRow>,
 }
 
 impl PathOutput {
     pub fn new(path: CameraPath, views: PathViews) -> PathOutput {
-        PathOutput { path, views, images: Vec::new(), rows: Vec::new() }
+        let cameras = views.cameras(path);
+        let size = |side: fn(&Camera) -> u32| cameras.iter().map(side).max().map_or(1.0, f64::from);
+        let (width, height) = (size(|c| c.width), size(|c| c.height));
+        let scale = (CELL / width.max(height)).min(1.0);
+        let cell = [width, height].map(|side| ((side * scale) as usize).max(1));
+        PathOutput { path, views, cameras, cell, images: Vec::new(), rows: Vec::new() }
     }
 
-    pub fn cameras(&self) -> Vec<Camera> {
-        self.views.cameras(self.path)
+    pub fn cameras(&self) -> &[Camera] {
+        &self.cameras
     }
 
     pub fn add(&mut self, camera: &Camera, view: &DecodedFrame) {
         self.rows.push(ViewRow { view: camera.name.clone(), score: self.views.score(camera, view) });
-        self.images.push(view.rendered.rgb.clone());
+        self.images.push(fitted(&view.rendered.rgb, self.cell));
     }
 
-    /// Writes `sheet.png`: four views per row, a photo and those up to the next one.
+    /// Writes the sheet: four views per row, a photo and those up to the next one.
     pub fn write_sheet(&self, out: &mut WrittenFiles) -> Result<()> {
-        let size = |side: fn(&RgbImage) -> usize| self.images.iter().map(side).max().unwrap_or(1);
-        let (width, height) = (size(|i| i.width), size(|i| i.height));
-        let scale = (CELL[0] as f64 / width as f64).min(CELL[1] as f64 / height as f64).min(1.0);
-        let cell = [width, height].map(|side| ((side as f64 * scale) as usize).max(1));
-        picture::write_png(&out.file("sheet.png")?, &sheet(&self.images, 4, cell))
+        picture::write_png(&out.file(SHEET)?, &sheet(&self.images, 4, self.cell))
     }
 
     /// Renders and writes `path.mp4`.

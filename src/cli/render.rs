@@ -9,6 +9,7 @@ use super::views;
 use crate::format::npy::{self, NpyArray};
 use crate::format::picture::{self, Planes};
 use crate::gpu;
+use crate::photo::VideoWriter;
 use crate::report::colour;
 use crate::run::path::PathViews;
 use crate::run::view::{DecodedFrame, UnseenShare, Viewer};
@@ -21,6 +22,9 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     let inputs: Vec<&Path> =
         std::iter::once(&args.scene).chain(&args.cameras).map(PathBuf::as_path).collect();
     let mut out = WrittenFiles::open(&args.out, args.force, &inputs)?;
+    if args.video {
+        VideoWriter::check()?;
+    }
     let scene = scene::load(&args.scene)?;
     let given = args.cameras.as_deref().map(views::read).transpose()?;
     let wants_language = args.channels.iter().any(|c| matches!(c, Channel::Features | Channel::Codes));
@@ -51,8 +55,13 @@ pub fn render(args: &RenderArgs) -> Result<()> {
         }
         None => None,
     };
-    let cameras = path.as_ref().map(PathOutput::cameras).or(given).unwrap_or_default();
+    let cameras = path.as_ref().map(|p| p.cameras().to_vec()).or(given).unwrap_or_default();
     let stems = views::stems(&cameras)?;
+    if path.is_some() && stems.iter().any(|s| s == "sheet") {
+        return Err(Error::input(
+            "--path: a photo is called \"sheet\", as the sheet of all views; rename it",
+        ));
+    }
     let progress = progress::reporter();
     progress.begin("render", cameras.len() as u64);
     for (i, (camera, stem)) in cameras.iter().zip(&stems).enumerate() {

@@ -243,6 +243,9 @@ impl Evaluation {
         }
         let (camera, target) = (&frame.camera, self.truth.image(frame)?);
         let shown = shown_pixels(camera, &depth, &self.photos);
+        if !shown.contains(&true) {
+            return Ok(());
+        }
         let scale = self.similarity.scale as f32;
         let depth = rendered.depth.data.iter().map(|z| z * scale).collect();
         let depth = Image { data: depth, ..rendered.depth };

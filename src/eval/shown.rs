@@ -40,18 +40,14 @@ pub struct PhotoView {
     /// Camera z, 0 = unknown.
     depth: Image<f32>,
     /// Least and greatest [`opponent`] values in the window around each pixel.
-    range: Vec<[[f32; 2]; 3]>,
+    range: Vec<Range>,
 }
 
 impl PhotoView {
     /// `rgb` and `depth` (camera z, 0 = unknown) have the size of the camera.
     pub fn new(camera: Camera, rgb: &RgbImage, depth: Image<f32>) -> PhotoView {
         let radius = (WINDOW * rgb.width as f64).ceil() as usize;
-        let point = |c: &[f32; 3]| opponent(*c).map(|v| [v, v]);
-        let single: Vec<_> = rgb.data.iter().map(point).collect();
-        let (width, height) = (rgb.width, rgb.height);
-        let rows = window_range(&single, (width, height), (1, width), radius);
-        let range = window_range(&rows, (height, width), (width, 1), radius);
+        let range = window_range(rgb, radius);
         PhotoView { camera, depth, range }
     }
 
@@ -87,27 +83,31 @@ fn opponent([r, g, b]: [f32; 3]) -> [f32; 3] {
     [(r + g + b) / 3.0, r - g, b - g]
 }
 
-/// Ranges over 2 `radius` + 1 values along an axis of `count` values `step` apart; the other axis
-/// has `lines` of them, `line_step` apart.
-fn window_range(
-    values: &[[[f32; 2]; 3]],
-    (count, lines): (usize, usize),
-    (step, line_step): (usize, usize),
-    radius: usize,
-) -> Vec<[[f32; 2]; 3]> {
-    let mut out = values.to_vec();
-    for line in 0..lines {
-        let at = |k: usize| line * line_step + k * step;
-        for k in 0..count {
-            let window = k.saturating_sub(radius)..(k + radius + 1).min(count);
-            let range = &mut out[at(k)];
-            for value in window.map(|j| &values[at(j)]) {
-                for (a, v) in range.iter_mut().zip(value) {
-                    *a = [a[0].min(v[0]), a[1].max(v[1])];
-                }
-            }
+/// Least and greatest [`opponent`] values per channel.
+type Range = [[f32; 2]; 3];
+
+/// Ranges over the square of 2 `radius` + 1 pixels around each pixel.
+fn window_range(rgb: &RgbImage, radius: usize) -> Vec<Range> {
+    let (width, height) = (rgb.width, rgb.height);
+    let widen = |range: &mut Range, value: &Range| {
+        for (a, v) in range.iter_mut().zip(value) {
+            *a = [a[0].min(v[0]), a[1].max(v[1])];
         }
-    }
+    };
+    let single: Vec<Range> = rgb.data.iter().map(|c| opponent(*c).map(|v| [v, v])).collect();
+    let around = |k: usize, count: usize| k.saturating_sub(radius)..(k + radius + 1).min(count);
+    let mut rows = single.clone();
+    rows.par_chunks_mut(width.max(1)).zip(single.par_chunks(width.max(1))).for_each(|(out, row)| {
+        for (x, range) in out.iter_mut().enumerate() {
+            row[around(x, width)].iter().for_each(|value| widen(range, value));
+        }
+    });
+    let mut out = rows.clone();
+    out.par_chunks_mut(width.max(1)).enumerate().for_each(|(y, line)| {
+        for other in around(y, height) {
+            line.iter_mut().zip(&rows[other * width..]).for_each(|(range, value)| widen(range, value));
+        }
+    });
     out
 }
 

@@ -21,8 +21,8 @@ pub struct Losses {
     pub depth: Option<f64>,
     /// Weight of `mean max(0, s_max/s_min − 8)`, against needles.
     pub needles: Option<f64>,
-    /// Weight of mean |1 − A| over the used pixels of photos without transparency: every pixel
-    /// shows something, also where it is as black as the background of the render.
+    /// Weight of Σ |1 − A| over the used pixels of photos without transparency, divided by the number
+    /// of all pixels: every pixel shows something, also where it is as black as the background.
     pub opacity: Option<f64>,
 }
 
@@ -38,7 +38,7 @@ impl Losses {
     /// Warped photos: their edges are less sharp than those of photos, and their depth is the
     /// depth that warps them.
     pub(super) const VIRTUAL: Losses =
-        Losses { l1: 0.4, dssim: 0.0, depth: Some(0.02), needles: None, opacity: Some(0.05) };
+        Losses { l1: 0.4, dssim: 0.0, depth: Some(0.02), needles: Some(1e-3), opacity: Some(0.05) };
 
     /// Alpha that the objective asks of the pixels of a photo, −1 where it asks for none, and its
     /// weight per pixel.

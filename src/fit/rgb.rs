@@ -220,13 +220,6 @@ impl<'a> Run<'a> {
     ) -> Result<Self> {
         let half_res = (half_res_steps(options) > 0).then(|| OwnedPhotos::at_half_res(&photos));
         let first = half_res.as_ref().map_or(photos, OwnedPhotos::photos);
-        let virtual_views = match &half_res {
-            Some(half) if !photos.show_emptiness() => {
-                let (count, confidence) = (options.virtual_views, options.min_confidence);
-                virtual_views(&half.photos(), count, confidence, options.seed)
-            }
-            _ => OwnedPhotos::default(),
-        };
         let raster = RasterOptions {
             sh_degree: start.sh_degree,
             feature_mode: FeatureMode::Linear,
@@ -234,6 +227,13 @@ impl<'a> Run<'a> {
         };
         let losses = (&options.losses, options.min_confidence);
         let mut views = Views::new(device, first, losses, start.len(), 0, scale.near())?;
+        let virtual_views = match &half_res {
+            Some(half) if !photos.show_emptiness() => {
+                let (count, confidence) = (options.virtual_views, options.min_confidence);
+                virtual_views(&half.photos(), count, confidence, options.seed)
+            }
+            _ => OwnedPhotos::default(),
+        };
         if !virtual_views.images.is_empty() {
             let losses = (&Losses::VIRTUAL, options.min_confidence);
             views.add(device, virtual_views.photos(), losses, start.len(), 0)?;
@@ -411,7 +411,7 @@ impl Training for Run<'_> {
             self.losses(view).record_image(&mut rec, stage, item, &band);
             stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
         }
-        let needles = self.options.losses.ratio_penalty(model.count());
+        let needles = self.losses(view).ratio_penalty(model.count());
         model.record_update(&mut rec, &stage.raster, raster, needles);
         rec.download(&frame.status);
         rec.download(&stage.sums);
@@ -436,7 +436,9 @@ impl Training for Run<'_> {
     fn review(&mut self, step: usize) -> Result<StepReport> {
         let mut report = StepReport::default();
         let every = self.options.report_every.max(1);
-        if step > 0 && (step.is_multiple_of(every) || step == self.options.iterations) {
+        let is_due = step > 0 && (step.is_multiple_of(every) || step == self.options.iterations);
+        // Since the last point, all steps may have been on virtual views.
+        if is_due && !self.recent.is_empty() {
             let CurvePoint { loss, ssim, psnr, splats, .. } = self.measure(step)?;
             report.note = Some(format!("loss {loss:.4}, PSNR {psnr:.1}, {splats} splats"));
             report.figures = vec![("loss", loss), ("ssim", ssim), ("psnr", psnr), ("splats", splats as f64)];

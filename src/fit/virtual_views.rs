@@ -4,7 +4,7 @@
 //! A few photos leave splats free along the rays: from the side, surfaces open and splats that one
 //! photo alone supports stand in the way. Warped photos show how the surfaces look from there.
 use super::half_res::{OwnedPhotos, Photos};
-use crate::math::{Random, median};
+use crate::math::Random;
 use crate::scene::{Camera, CameraOrbit, Coverage, DepthMap, Image, Outside, RgbImage};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -24,10 +24,12 @@ const DISTANCE: [f64; 2] = [0.8, 1.25];
 pub(super) fn virtual_views(photos: &Photos, count: usize, min_confidence: f32, seed: u64) -> OwnedPhotos {
     let mut views = OwnedPhotos::default();
     let Photos { images, cameras, depths: Some(depths), coverage } = *photos else { return views };
-    let surfaces: Vec<Surface> = (0..images.len())
-        .map(|i| {
+    let with_depth = images.iter().zip(cameras).zip(depths).enumerate();
+    let surfaces: Vec<Surface> = with_depth
+        .filter(|(_, ((image, _), map))| map.depth.data.len() == image.data.len())
+        .map(|(i, ((image, camera), map))| {
             let coverage = coverage.get(i).and_then(Option::as_ref);
-            Surface::new(&images[i], &cameras[i], &depths[i], coverage, min_confidence)
+            Surface::new(image, camera, map, coverage, min_confidence)
         })
         .collect();
     let targets: Vec<DVec3> = surfaces.iter().filter_map(Surface::target).collect();
@@ -36,9 +38,9 @@ pub(super) fn virtual_views(photos: &Photos, count: usize, min_confidence: f32, 
     }
     let target = targets.iter().sum::<DVec3>() / targets.len() as f64;
     let cameras = around(cameras, target, count, seed);
-    let warped: Vec<Warped> = cameras.par_iter().map(|camera| warp(&surfaces, camera)).collect();
     let mut all_depths = Vec::new();
-    for (camera, Warped { image, depth, used }) in cameras.into_iter().zip(warped) {
+    for camera in cameras {
+        let Warped { image, depth, used } = warp(&surfaces, &camera);
         views.images.push(image);
         all_depths.push(DepthMap { depth, confidence: used.clone() });
         views.coverage.push(Some(Coverage { share: used, outside: Outside::Unknown }));
@@ -50,7 +52,7 @@ pub(super) fn virtual_views(photos: &Photos, count: usize, min_confidence: f32, 
 
 /// Cameras displaced from the photos in turn, to the left and to the right.
 fn around(photos: &[Camera], target: DVec3, count: usize, seed: u64) -> Vec<Camera> {
-    let up = photos.iter().map(|c| -c.pose.rotation.row(1)).sum::<DVec3>().normalize_or(-DVec3::Y);
+    let up = CameraOrbit::mean_up(photos).normalize_or(-DVec3::Y);
     let orbit = CameraOrbit::new(photos, target, up);
     let mut random = Random::new(seed ^ 0x51de);
     (0..count)
@@ -88,11 +90,8 @@ impl Surface<'_> {
 
     /// The point at the median depth of the central third.
     fn target(&self) -> Option<DVec3> {
-        let (w, h) = (self.depth.width / 3, self.depth.height / 3);
-        let part = self.depth.cropped((w, h), (self.depth.width - 2 * w, self.depth.height - 2 * h));
-        let mut known: Vec<f64> = part.data.iter().filter(|z| **z > 0.0).map(|z| f64::from(*z)).collect();
         let middle = DVec2::new(f64::from(self.camera.width), f64::from(self.camera.height)) / 2.0;
-        Some(self.camera.unproject(middle, median(&mut known)?))
+        Some(self.camera.unproject(middle, self.depth.central_median()?))
     }
 
     fn point(&self, index: usize) -> DVec3 {
@@ -212,7 +211,7 @@ struct Warped {
 }
 
 fn warp(surfaces: &[Surface], camera: &Camera) -> Warped {
-    let layers: Vec<Vec<Sample>> = surfaces.iter().map(|s| s.rasterised(camera)).collect();
+    let layers: Vec<Vec<Sample>> = surfaces.par_iter().map(|s| s.rasterised(camera)).collect();
     let (width, height) = (camera.width as usize, camera.height as usize);
     let mut image = RgbImage { width, height, data: vec![[0.0; 3]; width * height] };
     let mut depth = Image::filled(width, height, 0.0f32);

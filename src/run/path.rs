@@ -2,8 +2,9 @@
 use super::score::rendered;
 use super::view::{DecodedFrame, Viewer};
 use crate::eval::{PhotoView, ShownScore, shown_pixels, shown_score};
-use crate::scene::{Camera, CameraOrbit, Image, RgbImage, World};
-use crate::{Error, Result, math};
+use crate::photo::stem;
+use crate::scene::{Camera, CameraOrbit, RgbImage, World};
+use crate::{Error, Result};
 use glam::{DVec2, DVec3};
 
 /// Views to render.
@@ -39,7 +40,7 @@ impl PathViews {
         let (mut targets, mut photos) = (Vec::new(), Vec::new());
         for camera in cameras {
             let view = rendered(&viewer.view(camera)?);
-            targets.extend(central_depth(&view.depth).map(|z| {
+            targets.extend(view.depth.central_median().map(|z| {
                 let middle = DVec2::new(f64::from(camera.width), f64::from(camera.height)) / 2.0;
                 camera.unproject(middle, z)
             }));
@@ -51,8 +52,10 @@ impl PathViews {
             ));
         }
         let target = targets.iter().sum::<DVec3>() / targets.len() as f64;
-        let up = world.up.as_ref().map_or_else(|| mean_up(cameras), |up| up.direction);
-        Ok(PathViews { orbit: CameraOrbit::new(cameras, target, up.normalize_or(-DVec3::Y)), photos })
+        let up = world.up.as_ref().map_or_else(|| CameraOrbit::mean_up(cameras), |up| up.direction);
+        let named: Vec<Camera> =
+            cameras.iter().map(|c| Camera { name: stem(&c.name).into(), ..c.clone() }).collect();
+        Ok(PathViews { orbit: CameraOrbit::new(&named, target, up.normalize_or(-DVec3::Y)), photos })
     }
 
     /// The views of a path.
@@ -77,33 +80,24 @@ impl PathViews {
     }
 }
 
-/// Median depth of the central third of an image, `None` where it is empty.
-fn central_depth(depth: &Image<f32>) -> Option<f64> {
-    let (w, h) = (depth.width / 3, depth.height / 3);
-    let part = depth.cropped((w, h), (depth.width - 2 * w, depth.height - 2 * h));
-    let mut known: Vec<f64> = part.data.iter().filter(|z| **z > 0.0).map(|z| f64::from(*z)).collect();
-    math::median(&mut known)
+/// A view that fits into `cell` pixels (width, height), with colours clipped to [0, 1].
+pub fn fitted(view: &RgbImage, cell: [usize; 2]) -> RgbImage {
+    let scale = (cell[0] as f64 / view.width as f64).min(cell[1] as f64 / view.height as f64);
+    let [w, h] = [view.width, view.height].map(|side| ((side as f64 * scale) as usize).max(1));
+    let clipped = view.data.iter().map(|c| c.map(|v| v.clamp(0.0, 1.0))).collect();
+    RgbImage { data: clipped, ..*view }.resized_by_area(w, h)
 }
 
-/// Mean of the directions that are up in the photos.
-fn mean_up(cameras: &[Camera]) -> DVec3 {
-    cameras.iter().map(|c| -c.pose.rotation.row(1)).sum()
-}
-
-/// Views side by side, row by row, each scaled to fit `cell` pixels (width, height).
+/// Views side by side, row by row, each [`fitted`] into the same `cell`.
 pub fn sheet(views: &[RgbImage], columns: usize, cell: [usize; 2]) -> RgbImage {
     let columns = columns.min(views.len()).max(1);
     let [width, height] = [cell[0] * columns, cell[1] * views.len().div_ceil(columns)];
     let mut out = RgbImage { width, height, data: vec![[1.0; 3]; width * height] };
     for (k, view) in views.iter().enumerate() {
-        let scale = (cell[0] as f64 / view.width as f64).min(cell[1] as f64 / view.height as f64);
-        let [w, h] = [view.width, view.height].map(|side| ((side as f64 * scale) as usize).max(1));
-        let clipped = view.data.iter().map(|c| c.map(|v| v.clamp(0.0, 1.0))).collect();
-        let small = RgbImage { data: clipped, ..*view }.resized_by_area(w, h);
         let [left, top] = [(k % columns) * cell[0], (k / columns) * cell[1]];
-        for y in 0..h {
+        for (y, row) in view.data.chunks_exact(view.width).enumerate() {
             let start = (top + y) * width + left;
-            out.data[start..start + w].copy_from_slice(&small.data[y * w..(y + 1) * w]);
+            out.data[start..start + view.width].copy_from_slice(row);
         }
     }
     out
@@ -116,7 +110,8 @@ mod tests {
     #[test]
     fn sheet_places_views_in_rows() {
         let view = |v: f32, width: usize| RgbImage { width, height: 4, data: vec![[v; 3]; 4 * width] };
-        let sheet = sheet(&[view(0.1, 8), view(0.2, 8), view(0.3, 2)], 2, [4, 2]);
+        let views = [view(0.1, 8), view(0.2, 8), view(0.3, 2)].map(|v| fitted(&v, [4, 2]));
+        let sheet = sheet(&views, 2, [4, 2]);
         assert_eq!((sheet.width, sheet.height), (8, 4));
         let value = |x, y| (sheet.at(x, y)[0] * 10.0).round();
         assert_eq!(
@@ -124,16 +119,5 @@ mod tests {
             [1.0, 1.0, 2.0, 3.0, 10.0]
         );
         assert_eq!(value(5, 3), 10.0);
-    }
-
-    #[test]
-    fn central_depth_ignores_border() {
-        let mut depth = Image::filled(9, 9, 7.0f32);
-        for i in 0..9 {
-            depth.data[3 * 9 + 3 + i % 3 + 9 * (i / 3)] = 2.0;
-        }
-        depth.data[4 * 9 + 4] = 0.0;
-        assert_eq!(central_depth(&depth), Some(2.0));
-        assert_eq!(central_depth(&Image::filled(9, 9, 0.0)), None);
     }
 }

@@ -284,7 +284,7 @@ pub(super) fn summarise(
     figures: impl Fn(&[&Score]) -> BTreeMap<String, f64>,
 ) -> BTreeMap<String, ProtocolSummary> {
     let mut out = BTreeMap::new();
-    for split in [Split::Train, Split::Test] {
+    for split in [Split::Train, Split::Test, Split::Out] {
         let scores: Vec<&Score> = scores.iter().filter(|s| s.split == split).collect();
         if scores.is_empty() {
             continue;

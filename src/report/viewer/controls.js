@@ -140,7 +140,7 @@ function keys(view, zoomAt) {
     motion.fast = e.shiftKey;
     motion.walking.delete(e.key.toLowerCase());
   });
-  root.addEventListener("blur", () => motion.walking.clear());
+  root.addEventListener("focusout", () => motion.walking.clear());
 }
 
 /// The list of keys, a modal dialog: the browser keeps the focus inside and gives it back.

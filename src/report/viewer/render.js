@@ -216,7 +216,7 @@ function program(gl, vertex, fragment) {
     gl.attachShader(made, shader);
   }
   gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
+  if (!gl.getProgramParameter(made, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(made));
   const at = {};
   for (let i = 0; i < gl.getProgramParameter(made, gl.ACTIVE_UNIFORMS); i++) {
     const { name } = gl.getActiveUniform(made, i);
@@ -271,6 +271,8 @@ export class Renderer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, made);
     textures.forEach((texture, k) => gl.framebufferTexture2D(gl.FRAMEBUFFER, slots[k], gl.TEXTURE_2D, texture, 0));
     gl.drawBuffers(slots);
+    const complete = gl.checkFramebufferStatus(gl.FRAMEBUFFER) === gl.FRAMEBUFFER_COMPLETE;
+    if (!complete && !gl.isContextLost()) throw new Error("this graphics device offers too few image formats");
     return made;
   }
 

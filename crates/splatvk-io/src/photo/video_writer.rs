@@ -20,6 +20,19 @@ pub struct VideoWriter {
 }
 
 impl VideoWriter {
+    /// Refuses a machine without ffmpeg or without its encoder, before any work.
+    pub fn check() -> Result<()> {
+        let encoders =
+            Command::new("ffmpeg").args(["-hide_banner", "-encoders"]).stdin(Stdio::null()).output();
+        match encoders {
+            Err(_) => Err(Error::missing(format!("--video: ffmpeg is not there; {INSTALL}"))),
+            Ok(o) if !String::from_utf8_lossy(&o.stdout).contains("libx264") => {
+                Err(Error::missing(format!("--video: this ffmpeg has no libx264; {INSTALL}")))
+            }
+            Ok(_) => Ok(()),
+        }
+    }
+
     /// Starts a video of `size` (width, height, pixels; the last column or row of an odd size is
     /// left out, as the format demands).
     ///
@@ -65,11 +78,12 @@ impl VideoWriter {
     /// The error that ffmpeg reports.
     fn failure(&mut self) -> Error {
         drop(self.child.stdin.take());
-        let mut text = String::new();
+        let mut bytes = Vec::new();
         if let Some(stderr) = self.child.stderr.as_mut() {
             // 4 KiB: one line is used.
-            let _ = stderr.take(4096).read_to_string(&mut text);
+            let _ = stderr.take(4096).read_to_end(&mut bytes);
         }
+        let text = String::from_utf8_lossy(&bytes);
         let line = text.lines().next().unwrap_or("it ended without a message").trim().to_owned();
         Error::work(format!("{}: ffmpeg does not write the video: {line}", self.path.display()))
     }

@@ -92,15 +92,13 @@ impl<'a> View<'a> {
                 is_filled && self.refutes(k, self.complete.planes[index])
             })
             .collect();
-        let mut out = Vec::new();
-        for face in self.components(&refuted) {
-            let Some(plane) = self.plane_of(&face, &refuted, large, hash(seed ^ face[0] as u32)) else {
-                continue;
-            };
+        let pixels_of = |face: &Vec<usize>| -> Vec<(usize, Vec3)> {
+            let seed = hash(seed ^ face[0] as u32);
+            let Some(plane) = self.plane_of(face, &refuted, large, seed) else { return Vec::new() };
             let sound = face.iter().filter(|k| !self.refutes(**k, plane));
-            out.extend(sound.map(|k| (self.first + k, plane)));
-        }
-        out
+            sound.map(|k| (self.first + k, plane)).collect()
+        };
+        self.components(&refuted).par_iter().flat_map_iter(pixels_of).collect()
     }
 
     /// Connected groups of refuted pixels, without the small ones.
@@ -206,29 +204,42 @@ impl<'a> View<'a> {
         scored.retain(|(score, _)| *score >= least);
         // The order of equal ones is that of the draws.
         scored.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let mut sound = scored.into_iter().filter(|(_, plane)| is_sound(plane));
-        let best = sound.next()?;
+        let mut rest = scored.into_iter();
+        let best = rest.by_ref().find(|(_, plane)| is_sound(plane))?;
         // A plane further back leaves a gap to the surface in front, and hides there, too.
-        let enough = sound.take_while(|(score, _)| *score >= NEAREST_OF * best.0);
+        let enough = rest.take_while(|(score, _)| *score >= NEAREST_OF * best.0);
         let middle = self.ray(face[face.len() / 2]);
         let inverse = |plane: &Vec3| plane.dot(middle);
         let nearer = |a: Vec3, b: Vec3| if inverse(&b) > inverse(&a) { b } else { a };
-        Some(enough.map(|(_, plane)| plane).fold(best.1, nearer))
+        Some(enough.map(|(_, plane)| plane).filter(is_sound).fold(best.1, nearer))
     }
 
     /// Rays and inverse depths of pixels around a face, of those that no view refutes.
     fn rim(&self, face: &[usize], refuted: &[bool]) -> Vec<(Vec3, f32)> {
         let radius = ((RIM_SHARE * self.width as f32) as usize).max(4);
-        let mut near = vec![false; self.width * self.height];
-        for k in face {
-            let (x, y) = (k % self.width, k / self.width);
-            for py in y.saturating_sub(radius)..(y + radius + 1).min(self.height) {
-                let row = py * self.width;
-                near[row + x.saturating_sub(radius)..row + (x + radius + 1).min(self.width)].fill(true);
+        let place = |k: usize| (k % self.width, k / self.width);
+        let bounds = |axis: fn((usize, usize)) -> usize, count: usize| {
+            let values = || face.iter().map(|k| axis(place(*k)));
+            let (low, high) = (values().min().unwrap_or(0), values().max().unwrap_or(0));
+            low.saturating_sub(radius)..(high + radius + 1).min(count)
+        };
+        let (columns, rows) = (bounds(|p| p.0, self.width), bounds(|p| p.1, self.height));
+        let mut near = vec![false; columns.len() * rows.len()];
+        // Windows around the outline cover those around the inner pixels, but for the face itself.
+        let is_outline = |k: &&usize| neighbours(**k, self.width, self.height).any(|n| !refuted[n]);
+        for k in face.iter().filter(is_outline) {
+            let (x, y) = place(*k);
+            for row in y.saturating_sub(radius)..(y + radius + 1).min(rows.end) {
+                let line = (row - rows.start) * columns.len();
+                let (from, to) =
+                    (x.saturating_sub(radius).max(columns.start), (x + radius + 1).min(columns.end));
+                near[line + from - columns.start..line + to - columns.start].fill(true);
             }
         }
-        let known = |k: &usize| near[*k] && !refuted[*k] && self.complete.confidence[self.first + k] > 0.0;
-        let pixels: Vec<usize> = (0..near.len()).filter(known).collect();
+        let index =
+            |i: usize| (rows.start + i / columns.len()) * self.width + columns.start + i % columns.len();
+        let known = |k: &usize| !refuted[*k] && self.complete.confidence[self.first + k] > 0.0;
+        let pixels: Vec<usize> = (0..near.len()).filter(|i| near[*i]).map(index).filter(known).collect();
         let value = |k: usize| {
             let ray = self.ray(k);
             (ray, self.complete.planes[self.first + k].dot(ray))

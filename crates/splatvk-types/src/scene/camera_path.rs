@@ -36,7 +36,7 @@ const MIDDLE: [Beside; 4] = [
 ///     pose: Pose { rotation: DMat3::IDENTITY, translation: DVec3::new(-x, 0.0, 0.0) },
 /// };
 /// // Two photos side by side that show a point three units in front of them.
-/// let photos = [camera("b.jpg", 0.5), camera("a.jpg", -0.5)];
+/// let photos = [camera("b", 0.5), camera("a", -0.5)];
 /// let orbit = CameraOrbit::new(&photos, DVec3::new(0.0, 0.0, 3.0), -DVec3::Y);
 /// assert_eq!(orbit.beyond().len(), 8);
 /// let names: Vec<_> = orbit.between().into_iter().map(|c| c.name).collect();
@@ -73,18 +73,22 @@ impl CameraOrbit {
         CameraOrbit { photos: order.into_iter().map(|(_, c)| c.clone()).collect(), middle, target, up }
     }
 
+    /// Mean of the directions that are up in the images of cameras; not of unit length.
+    pub fn mean_up(cameras: &[Camera]) -> DVec3 {
+        cameras.iter().map(|c| -c.pose.rotation.row(1)).sum()
+    }
+
     /// The cameras of the photos from left to right, with three views between neighbours.
     pub fn between(&self) -> Vec<Camera> {
-        let named = |c: &Camera| Camera { name: stem(&c.name).into(), ..c.clone() };
         let mut out = Vec::new();
         for pair in self.photos.windows(2) {
-            out.push(named(&pair[0]));
+            out.push(pair[0].clone());
             out.extend((1..=BETWEEN).map(|k| Camera {
-                name: format!("{}_{}_{k}", stem(&pair[0].name), stem(&pair[1].name)),
+                name: format!("{}_{}_{k}", pair[0].name, pair[1].name),
                 ..self.interpolated(&pair[0], &pair[1], k as f64 / (BETWEEN + 1) as f64)
             }));
         }
-        out.extend(self.photos.last().map(named));
+        out.extend(self.photos.last().cloned());
         out
     }
 
@@ -165,12 +169,6 @@ impl CameraOrbit {
     }
 }
 
-/// File name without folders and ending.
-fn stem(name: &str) -> &str {
-    let file = name.rsplit(['/', '\\']).next().unwrap_or(name);
-    file.rsplit_once('.').map_or(file, |(stem, _)| stem)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -198,10 +196,10 @@ mod tests {
 
     #[test]
     fn views_beyond_keep_target_centred() {
-        let photos = [camera("m.jpg", 2.0, 20.0), camera("r.jpg", 30.0, 20.0), camera("l.jpg", -25.0, 20.0)];
+        let photos = [camera("m", 2.0, 20.0), camera("r", 30.0, 20.0), camera("l", -25.0, 20.0)];
         let orbit = CameraOrbit::new(&photos, TARGET, -DVec3::Y);
         let order: Vec<&str> = orbit.photos.iter().map(|c| c.name.as_str()).collect();
-        assert_eq!(order, ["l.jpg", "m.jpg", "r.jpg"]);
+        assert_eq!(order, ["l", "m", "r"]);
         let views = orbit.beyond();
         for view in &views {
             let (pixel, depth) = view.project(TARGET);
@@ -229,7 +227,7 @@ mod tests {
 
     #[test]
     fn views_between_divide_the_angle() {
-        let photos = [camera("l.jpg", -30.0, 0.0), camera("r.jpg", 30.0, 0.0)];
+        let photos = [camera("l", -30.0, 0.0), camera("r", 30.0, 0.0)];
         let orbit = CameraOrbit::new(&photos, TARGET, -DVec3::Y);
         let views = orbit.between();
         let names: Vec<&str> = views.iter().map(|v| v.name.as_str()).collect();
@@ -242,7 +240,7 @@ mod tests {
 
     #[test]
     fn video_passes_all_stops() {
-        let photos = [camera("l.jpg", -30.0, 0.0), camera("r.jpg", 30.0, 0.0)];
+        let photos = [camera("l", -30.0, 0.0), camera("r", 30.0, 0.0)];
         let orbit = CameraOrbit::new(&photos, TARGET, -DVec3::Y);
         assert_eq!(orbit.video(false, 10).len(), 11);
         let video = orbit.video(true, 10);

@@ -44,6 +44,17 @@ pub struct RgbImage {
     pub data: Vec<[f32; 3]>,
 }
 
+impl Image<f32> {
+    /// Median of the positive values in the central third; `None` without any.
+    pub fn central_median(&self) -> Option<f64> {
+        let (w, h) = (self.width / 3, self.height / 3);
+        let part = self.cropped((w, h), (self.width - 2 * w, self.height - 2 * h));
+        crate::math::median(
+            &mut part.data.iter().filter(|v| **v > 0.0).map(|v| f64::from(*v)).collect::<Vec<_>>(),
+        )
+    }
+}
+
 impl RgbImage {
     /// Colour at column x, row y.
     pub fn at(&self, x: usize, y: usize) -> [f32; 3] {
