@@ -47,13 +47,6 @@ fn page(report: &HtmlReport) -> Result<String> {
         // Writing to a String cannot fail.
         let _ = write!(body, "<section class=\"note\"><h2>Warnings</h2><ul>{items}</ul></section>");
     }
-    body.push_str("<section class=\"figures\">");
-    // Cards are for short figures: the device is below the times, and answers have their own
-    // section.
-    for (label, value) in report.figures.iter().filter(|(l, _)| l != "device" && !l.starts_with('“')) {
-        let _ = write!(body, "<div><b>{}</b><span>{}</span></div>", escape(value), escape(label));
-    }
-    body.push_str("</section>");
     if let Some((section, note)) = scene? {
         let _ = write!(body, "{section}<p class=\"small\">{}</p>", escape(&note));
     }
@@ -61,6 +54,12 @@ fn page(report: &HtmlReport) -> Result<String> {
     body.push_str("<section><h2>Views</h2>");
     body.push_str(&views?);
     body.push_str("</section>");
+    body.push_str("<section><h2>Figures</h2><dl class=\"figures\">");
+    // The device is below the times, and answers have their own section.
+    for (label, value) in report.figures.iter().filter(|(l, _)| l != "device" && !l.starts_with('“')) {
+        let _ = write!(body, "<dt>{}</dt><dd>{}</dd>", escape(label), escape(value));
+    }
+    body.push_str("</dl></section>");
     let charts: String = report.curves.iter().map(curve).collect();
     if !charts.is_empty() {
         let _ = write!(body, "<section><h2>Training</h2><div class=\"row curves\">{charts}</div></section>");
