@@ -1,6 +1,6 @@
 //! Reflection of SPIR-V: storage buffers with their access, push constants, workgroup size,
-//! capabilities. An unsupported feature is an error that names it.
-use spirv::{Capability, Decoration, ExecutionMode, Op, StorageClass};
+//! capabilities. An unsupported feature is an error that names it. Opcodes and enumerants are those
+//! of the SPIR-V specification 1.5 and its extension registry.
 use std::collections::{BTreeMap, HashMap};
 
 /// How a module touches one storage buffer.
@@ -73,24 +73,24 @@ pub struct Reflection {
     pub capabilities: Vec<&'static str>,
 }
 
-/// SPIR-V capability → variant of `splatvk_gpu::Capability`; `None` for those that every
+/// SPIR-V capability number → variant of `splatvk_gpu::Capability`; `None` for those that every
 /// Vulkan 1.2 device has.
-const CAPABILITIES: &[(Capability, Option<&str>)] = &[
-    (Capability::Shader, None),
-    (Capability::Float16, Some("Float16")),
-    (Capability::Float64, Some("Float64")),
-    (Capability::Int64, Some("Int64")),
-    (Capability::Int16, Some("Int16")),
-    (Capability::Int8, Some("Int8")),
-    (Capability::GroupNonUniform, Some("SubgroupBasic")),
-    (Capability::GroupNonUniformVote, Some("SubgroupVote")),
-    (Capability::GroupNonUniformArithmetic, Some("SubgroupArithmetic")),
-    (Capability::GroupNonUniformBallot, Some("SubgroupBallot")),
-    (Capability::GroupNonUniformShuffle, Some("SubgroupShuffle")),
-    (Capability::GroupNonUniformShuffleRelative, Some("SubgroupShuffleRelative")),
-    (Capability::StorageBuffer16BitAccess, Some("Storage16")),
-    (Capability::StorageBuffer8BitAccess, Some("Storage8")),
-    (Capability::AtomicFloat32AddEXT, Some("AtomicFloatAdd")),
+const CAPABILITIES: &[(u32, Option<&str>)] = &[
+    (1, None), // Shader
+    (9, Some("Float16")),
+    (10, Some("Float64")),
+    (11, Some("Int64")),
+    (22, Some("Int16")),
+    (39, Some("Int8")),
+    (61, Some("SubgroupBasic")),
+    (62, Some("SubgroupVote")),
+    (63, Some("SubgroupArithmetic")),
+    (64, Some("SubgroupBallot")),
+    (65, Some("SubgroupShuffle")),
+    (66, Some("SubgroupShuffleRelative")),
+    (4433, Some("Storage16")),
+    (4448, Some("Storage8")),
+    (6033, Some("AtomicFloatAdd")),
 ];
 
 enum Type {
@@ -108,21 +108,32 @@ enum Type {
 struct Reader {
     names: HashMap<u32, String>,
     member_names: HashMap<(u32, u32), String>,
-    decorations: HashMap<(u32, Decoration), u32>,
-    member_decorations: HashMap<(u32, u32, Decoration), u32>,
+    decorations: HashMap<(u32, u32), u32>,
+    member_decorations: HashMap<(u32, u32, u32), u32>,
     types: HashMap<u32, Type>,
     constants: HashMap<u32, u32>,
     /// Variable id → (storage class, pointer type).
-    variables: BTreeMap<u32, (StorageClass, u32)>,
+    variables: BTreeMap<u32, (u32, u32)>,
     /// Pointer id → the variable it leads into.
     roots: HashMap<u32, u32>,
     used: HashMap<u32, Access>,
     out: Reflection,
 }
 
+const BUILT_IN: u32 = 11;
+const NON_WRITABLE: u32 = 24;
+const NON_READABLE: u32 = 25;
+const ARRAY_STRIDE: u32 = 6;
+const MATRIX_STRIDE: u32 = 7;
+const BINDING: u32 = 33;
+const DESCRIPTOR_SET: u32 = 34;
+const OFFSET: u32 = 35;
+const STORAGE_PUSH_CONSTANT: u32 = 9;
+const STORAGE_BUFFER: u32 = 12;
+
 /// Reads one unoptimised module.
 pub fn reflect(words: &[u32]) -> Result<Reflection, String> {
-    if words.first() != Some(&spirv::MAGIC_NUMBER) {
+    if words.first() != Some(&0x0723_0203) {
         return Err("not a SPIR-V module".into());
     }
     let mut reader = Reader::default();
@@ -143,96 +154,58 @@ fn text(words: &[u32]) -> String {
 
 impl Reader {
     fn instruction(&mut self, opcode: u32, o: &[u32]) -> Result<(), String> {
-        // Instructions of unknown extensions have no part in the interface.
-        let Some(op) = Op::from_u32(opcode) else { return Ok(()) };
-        match op {
-            Op::Name => drop(self.names.insert(o[0], text(&o[1..]))),
-            Op::MemberName => drop(self.member_names.insert((o[0], o[1]), text(&o[2..]))),
-            Op::ExecutionMode if o[1] == ExecutionMode::LocalSize as u32 => {
-                self.out.workgroup = [o[2], o[3], o[4]];
-            }
-            Op::Capability => self.capability(o[0])?,
-            Op::TypeInt if o[1] == 32 => {
+        match opcode {
+            5 => drop(self.names.insert(o[0], text(&o[1..]))),
+            6 => drop(self.member_names.insert((o[0], o[1]), text(&o[2..]))),
+            16 if o[1] == 17 => self.out.workgroup = [o[2], o[3], o[4]],
+            17 => self.capability(o[0])?,
+            21 if o[1] == 32 => {
                 let scalar = if o[2] == 0 { Scalar::U32 } else { Scalar::I32 };
                 self.types.insert(o[0], Type::Scalar(scalar));
             }
-            Op::TypeFloat if o[1] == 32 => drop(self.types.insert(o[0], Type::Scalar(Scalar::F32))),
-            Op::TypeInt | Op::TypeFloat => drop(self.types.insert(o[0], Type::Other)),
-            Op::TypeVector => drop(self.types.insert(o[0], Type::Vector(o[1], o[2]))),
-            Op::TypeMatrix => drop(self.types.insert(o[0], Type::Matrix(o[1], o[2]))),
-            Op::TypeArray => drop(self.types.insert(o[0], Type::Array(o[1], o[2]))),
-            Op::TypeRuntimeArray => drop(self.types.insert(o[0], Type::RuntimeArray(o[1]))),
-            Op::TypeStruct => drop(self.types.insert(o[0], Type::Struct(o[1..].to_vec()))),
-            Op::TypePointer => drop(self.types.insert(o[0], Type::Pointer(o[2]))),
-            Op::Constant => drop(self.constants.insert(o[1], o[2])),
-            Op::SpecConstantTrue
-            | Op::SpecConstantFalse
-            | Op::SpecConstant
-            | Op::SpecConstantComposite
-            | Op::SpecConstantOp => {
-                return Err("specialisation constants are not supported: use `// variants:`".into());
-            }
-            Op::Variable => {
-                if let Some(class) = StorageClass::from_u32(o[2]) {
-                    self.variables.insert(o[1], (class, o[0]));
-                }
+            22 if o[1] == 32 => drop(self.types.insert(o[0], Type::Scalar(Scalar::F32))),
+            29 => drop(self.types.insert(o[0], Type::RuntimeArray(o[1]))),
+            21 | 22 => drop(self.types.insert(o[0], Type::Other)),
+            23 => drop(self.types.insert(o[0], Type::Vector(o[1], o[2]))),
+            24 => drop(self.types.insert(o[0], Type::Matrix(o[1], o[2]))),
+            28 => drop(self.types.insert(o[0], Type::Array(o[1], o[2]))),
+            30 => drop(self.types.insert(o[0], Type::Struct(o[1..].to_vec()))),
+            32 => drop(self.types.insert(o[0], Type::Pointer(o[2]))),
+            43 => drop(self.constants.insert(o[1], o[2])),
+            48..=52 => return Err("specialisation constants are not supported: use `// variants:`".into()),
+            59 => {
+                self.variables.insert(o[1], (o[2], o[0]));
                 self.roots.insert(o[1], o[1]);
             }
-            Op::Decorate => {
-                if let Some(decoration) = Decoration::from_u32(o[1]) {
-                    self.decorations.insert((o[0], decoration), o.get(2).copied().unwrap_or(0));
-                }
-            }
-            Op::MemberDecorate => {
-                if let Some(decoration) = Decoration::from_u32(o[2]) {
-                    let value = o.get(3).copied().unwrap_or(0);
-                    self.member_decorations.insert((o[0], o[1], decoration), value);
-                }
-            }
-            _ => self.access(op, o),
+            71 => drop(self.decorations.insert((o[0], o[1]), o.get(2).copied().unwrap_or(0))),
+            72 => drop(self.member_decorations.insert((o[0], o[1], o[2]), o.get(3).copied().unwrap_or(0))),
+            _ => self.access(opcode, o),
         }
         Ok(())
     }
 
     /// Follows pointers to their variables and records the accesses.
-    fn access(&mut self, op: Op, o: &[u32]) {
+    fn access(&mut self, opcode: u32, o: &[u32]) {
         const READ: Access = Access { read: true, write: false };
         const WRITE: Access = Access { read: false, write: true };
         const BOTH: Access = Access { read: true, write: true };
-        match op {
-            Op::Load | Op::AtomicLoad => self.touch(o[2], READ),
-            Op::Store | Op::AtomicStore => self.touch(o[0], WRITE),
-            Op::CopyMemory => {
+        match opcode {
+            61 | 227 => self.touch(o[2], READ),  // OpLoad, OpAtomicLoad
+            62 | 228 => self.touch(o[0], WRITE), // OpStore, OpAtomicStore
+            63 => {
                 self.touch(o[0], WRITE);
                 self.touch(o[1], READ);
             }
-            Op::AccessChain | Op::InBoundsAccessChain => {
+            65 | 66 => {
                 if let Some(&root) = self.roots.get(&o[2]) {
                     self.roots.insert(o[1], root);
                 }
             }
-            // Reads the descriptor, not the memory.
-            Op::ArrayLength => {}
-            Op::AtomicExchange
-            | Op::AtomicCompareExchange
-            | Op::AtomicIIncrement
-            | Op::AtomicIDecrement
-            | Op::AtomicIAdd
-            | Op::AtomicISub
-            | Op::AtomicSMin
-            | Op::AtomicUMin
-            | Op::AtomicSMax
-            | Op::AtomicUMax
-            | Op::AtomicAnd
-            | Op::AtomicOr
-            | Op::AtomicXor
-            | Op::AtomicFAddEXT
-            | Op::AtomicFMinEXT
-            | Op::AtomicFMaxEXT => self.touch(o[2], BOTH),
-            // A pointer that is passed on may be used for anything.
-            Op::FunctionCall | Op::CopyObject | Op::Select | Op::Phi => {
-                o[2..].iter().for_each(|&id| self.touch(id, BOTH));
-            }
+            68 => {} // OpArrayLength reads the descriptor, not the memory.
+            229..=242 | 6035 | 5614 | 5615 => self.touch(o[2], BOTH),
+            // OpFunctionCall, OpCopyObject, OpSelect, OpPhi: a pointer handed on may be used for
+            // anything.
+            57 | 83 | 169 | 245 => o[2..].iter().for_each(|&id| self.touch(id, BOTH)),
             _ => {}
         }
     }
@@ -246,40 +219,35 @@ impl Reader {
     }
 
     fn capability(&mut self, number: u32) -> Result<(), String> {
-        let capability = Capability::from_u32(number);
-        match CAPABILITIES.iter().find(|(known, _)| Some(*known) == capability) {
+        match CAPABILITIES.iter().find(|(n, _)| *n == number) {
             Some((_, Some(name))) => self.out.capabilities.push(name),
             Some((_, None)) => {}
             None => {
-                let name = capability.map_or_else(|| number.to_string(), |c| format!("{c:?}"));
-                return Err(format!("SPIR-V capability {name} is not supported"));
+                return Err(format!("SPIR-V capability {number} is not supported"));
             }
         }
         Ok(())
     }
 
     fn finish(mut self) -> Result<Reflection, String> {
-        let variables: Vec<(u32, (StorageClass, u32))> =
-            self.variables.iter().map(|(&i, &v)| (i, v)).collect();
+        let variables: Vec<(u32, (u32, u32))> = self.variables.iter().map(|(&i, &v)| (i, v)).collect();
         for (id, (class, pointer)) in variables {
             let Some(&Type::Pointer(pointee)) = self.types.get(&pointer) else { continue };
             match class {
-                StorageClass::StorageBuffer => {
+                STORAGE_BUFFER => {
                     let binding = self.binding(id, pointee)?;
                     self.out.bindings.push(binding);
                     if let Some(layout) = self.layout(pointee)? {
                         self.out.layouts.push(layout);
                     }
                 }
-                StorageClass::PushConstant => self.push(pointee)?,
-                StorageClass::UniformConstant | StorageClass::Uniform => {
+                STORAGE_PUSH_CONSTANT => self.push(pointee)?,
+                0 | 2 => {
                     let name = self.names.get(&pointee).cloned().unwrap_or_default();
                     return Err(format!("`{name}`: only storage buffers and push constants are supported"));
                 }
-                // The host does not see built-ins, shared and private variables.
-                _ => debug_assert!(
-                    class != StorageClass::Input || self.decorations.contains_key(&(id, Decoration::BuiltIn))
-                ),
+                // Input (built-ins), Output, Workgroup, Private, Function: invisible from the host.
+                _ => debug_assert!(class != 1 || self.decorations.contains_key(&(id, BUILT_IN))),
             }
         }
         self.out.bindings.sort_by_key(|b| b.number);
@@ -300,24 +268,21 @@ impl Reader {
         let Some(Type::Struct(members)) = self.types.get(&block) else {
             return Err(format!("`{name}`: arrays of buffers are not supported"));
         };
-        if self.decorations.get(&(id, Decoration::DescriptorSet)).is_some_and(|&s| s != 0) {
+        if self.decorations.get(&(id, DESCRIPTOR_SET)).is_some_and(|&s| s != 0) {
             return Err(format!("`{name}`: only descriptor set 0 is supported"));
         }
-        let number = *self
-            .decorations
-            .get(&(id, Decoration::Binding))
-            .ok_or_else(|| format!("`{name}` has no binding number"))?;
-        let declared = |decoration: Decoration| {
-            self.decorations.contains_key(&(id, decoration))
-                || (0..members.len() as u32)
-                    .all(|m| self.member_decorations.contains_key(&(block, m, decoration)))
+        let number =
+            *self.decorations.get(&(id, BINDING)).ok_or_else(|| format!("`{name}` has no binding number"))?;
+        let declared = |what: u32| {
+            self.decorations.contains_key(&(id, what))
+                || (0..members.len() as u32).all(|m| self.member_decorations.contains_key(&(block, m, what)))
         };
         // `readonly` / `writeonly` are promises the GLSL compiler enforces; what the code does is
         // the finer truth.
         let used = self.used.get(&id).copied().unwrap_or_default();
         let access = Access {
-            read: used.read && !declared(Decoration::NonReadable),
-            write: used.write && !declared(Decoration::NonWritable),
+            read: used.read && !declared(NON_READABLE),
+            write: used.write && !declared(NON_WRITABLE),
         };
         let &[member] = members.as_slice() else {
             return Err(format!(
@@ -348,9 +313,7 @@ impl Reader {
         let Some(Type::Struct(block_members)) = self.types.get(&block) else { return Ok(None) };
         let &[member] = block_members.as_slice() else { return Ok(None) };
         let (id, stride) = match self.types.get(&member) {
-            Some(&Type::RuntimeArray(element)) => {
-                (element, self.decorations.get(&(member, Decoration::ArrayStride)))
-            }
+            Some(&Type::RuntimeArray(element)) => (element, self.decorations.get(&(member, ARRAY_STRIDE))),
             _ => (member, None),
         };
         let Some(Type::Struct(members)) = self.types.get(&id) else { return Ok(None) };
@@ -359,7 +322,7 @@ impl Reader {
         for (index, &kind) in members.iter().enumerate() {
             let index = index as u32;
             let member_name = self.member_names.get(&(id, index)).cloned().unwrap_or_default();
-            let offset = self.member_decorations.get(&(id, index, Decoration::Offset)).copied().unwrap_or(0);
+            let offset = self.member_decorations.get(&(id, index, OFFSET)).copied().unwrap_or(0);
             let member = self.member(id, index, kind, member_name.clone(), offset).ok_or_else(|| {
                 format!("`{name}.{member_name}`: a structure holds scalars, vectors and arrays of them")
             })?;
@@ -388,8 +351,7 @@ impl Reader {
         for (index, &kind) in members.iter().enumerate() {
             let index = index as u32;
             let name = self.member_names.get(&(block, index)).cloned().unwrap_or_default();
-            let offset =
-                self.member_decorations.get(&(block, index, Decoration::Offset)).copied().unwrap_or(0);
+            let offset = self.member_decorations.get(&(block, index, OFFSET)).copied().unwrap_or(0);
             let member = self.member(block, index, kind, name.clone(), offset).ok_or_else(|| {
                 format!("push constant `{name}`: use int, uint, float, vectors, matrices or arrays of them")
             })?;
@@ -409,16 +371,12 @@ impl Reader {
         let mut kind = kind;
         let mut array = None;
         if let Some(Type::Array(element, length)) = self.types.get(&kind) {
-            array = Some((
-                *self.constants.get(length)?,
-                *self.decorations.get(&(kind, Decoration::ArrayStride))?,
-            ));
+            array = Some((*self.constants.get(length)?, *self.decorations.get(&(kind, ARRAY_STRIDE))?));
             kind = *element;
         }
         let mut columns = None;
         if let Some(Type::Matrix(column, count)) = self.types.get(&kind) {
-            columns =
-                Some((*count, *self.member_decorations.get(&(block, index, Decoration::MatrixStride))?));
+            columns = Some((*count, *self.member_decorations.get(&(block, index, MATRIX_STRIDE))?));
             kind = *column;
         }
         let mut rows = 1;
