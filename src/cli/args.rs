@@ -178,7 +178,7 @@ pub struct RenderArgs {
     /// Cameras: transforms.json, a COLMAP model folder, or cameras.json
     #[arg(long, value_name = "FILE", required_unless_present = "path", conflicts_with = "path")]
     pub cameras: Option<PathBuf>,
-    /// Views along a path instead of given cameras, with a sheet of all, and their opacity and colours
+    /// Views along a path instead of given cameras, with a sheet of all, their opacity and colours
     #[arg(long, value_enum)]
     pub path: Option<PathKind>,
     /// Also a video along the path: path.mp4

@@ -21,8 +21,8 @@ pub struct Losses {
     pub depth: Option<f64>,
     /// Weight of `mean max(0, s_max/s_min − 8)`, against needles.
     pub needles: Option<f64>,
-    /// Weight of Σ |1 − A| over the used pixels of photos without transparency, divided by the number
-    /// of all pixels: every pixel shows something, also where it is as black as the background.
+    /// Weight of Σ |1 − A| over the used pixels of photos without transparency, divided by the
+    /// number of all pixels: every pixel shows something, also where it is black.
     pub opacity: Option<f64>,
 }
 

@@ -110,8 +110,8 @@ impl Surface<'_> {
         f64::from(self.depth.at(x as usize, y as usize)) > SEES_THROUGH * z
     }
 
-    /// The surfaces from another camera: per pixel the nearest one, with the cosine between the rays
-    /// of the two cameras; depth 0 where there is none.
+    /// The surfaces from another camera: per pixel the nearest one, with the cosine between the
+    /// rays of the two cameras; depth 0 where there is none.
     fn rasterised(&self, camera: &Camera) -> Vec<Sample> {
         let (width, height) = (self.depth.width, self.depth.height);
         let (out_width, out_height) = (camera.width as usize, camera.height as usize);

@@ -172,7 +172,8 @@ pub(super) fn file(path: &Path) -> OsString {
 }
 
 /// Kills and reaps the program when dropped before its end.
-struct Running(Child);
+#[derive(Debug)]
+pub(super) struct Running(pub(super) Child);
 
 impl Drop for Running {
     fn drop(&mut self) {

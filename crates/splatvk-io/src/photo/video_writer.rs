@@ -1,20 +1,20 @@
 //! Writes videos through `ffmpeg`, as a child process without a shell.
-use super::video::file;
+use super::video::{Running, file};
 use crate::scene::RgbImage;
 use crate::{Error, Result};
 use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 
 /// Advice where the program is missing.
 const INSTALL: &str =
     "install it (tools/setup; apt-get install ffmpeg; brew install ffmpeg), or leave the video out";
 
-/// Writer of an H.264 video in an MP4 file, frame by frame. Dropped without [`VideoWriter::finish`],
-/// it ends the program, and the file is not playable.
+/// Writer of an H.264 video in an MP4 file, frame by frame. Dropped without
+/// [`VideoWriter::finish`], it ends the program, and the file is not playable.
 #[derive(Debug)]
 pub struct VideoWriter {
-    child: Child,
+    child: Running,
     path: PathBuf,
     size: (usize, usize),
 }
@@ -52,7 +52,7 @@ impl VideoWriter {
             }
             _ => Error::work(format!("{}: ffmpeg does not start: {e}", path.display())),
         })?;
-        Ok(VideoWriter { child, path: path.to_path_buf(), size })
+        Ok(VideoWriter { child: Running(child), path: path.to_path_buf(), size })
     }
 
     /// Adds a frame of the video's size; colours are clipped to [0, 1].
@@ -62,14 +62,14 @@ impl VideoWriter {
         }
         let bytes: Vec<u8> =
             image.data.iter().flatten().map(|v| (v.clamp(0.0, 1.0) * 255.0).round() as u8).collect();
-        let written = self.child.stdin.as_mut().is_some_and(|stdin| stdin.write_all(&bytes).is_ok());
+        let written = self.child.0.stdin.as_mut().is_some_and(|stdin| stdin.write_all(&bytes).is_ok());
         if written { Ok(()) } else { Err(self.failure()) }
     }
 
     /// Completes the file.
     pub fn finish(mut self) -> Result<()> {
-        drop(self.child.stdin.take());
-        match self.child.wait() {
+        drop(self.child.0.stdin.take());
+        match self.child.0.wait() {
             Ok(status) if status.success() => Ok(()),
             _ => Err(self.failure()),
         }
@@ -77,22 +77,15 @@ impl VideoWriter {
 
     /// The error that ffmpeg reports.
     fn failure(&mut self) -> Error {
-        drop(self.child.stdin.take());
+        drop(self.child.0.stdin.take());
         let mut bytes = Vec::new();
-        if let Some(stderr) = self.child.stderr.as_mut() {
+        if let Some(stderr) = self.child.0.stderr.as_mut() {
             // 4 KiB: one line is used.
             let _ = stderr.take(4096).read_to_end(&mut bytes);
         }
         let text = String::from_utf8_lossy(&bytes);
         let line = text.lines().next().unwrap_or("it ended without a message").trim().to_owned();
         Error::work(format!("{}: ffmpeg does not write the video: {line}", self.path.display()))
-    }
-}
-
-impl Drop for VideoWriter {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
     }
 }
 

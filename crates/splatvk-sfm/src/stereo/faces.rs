@@ -16,7 +16,8 @@ use rayon::prelude::*;
 
 /// Smallest face, share of the image; smaller groups of refuted pixels are edges.
 const SMALLEST: f32 = 4e-4;
-/// Width of the rim, share of the view's width: the trimmed depth edge and half the matching window.
+/// Width of the rim, share of the view's width: the trimmed depth edge and half the matching
+/// window.
 const RIM_SHARE: f32 = 1.0 / 50.0;
 /// Hypotheses per kind: through three pixels of the rim, and through two along an axis.
 const TRIALS: u32 = 400;
@@ -26,8 +27,8 @@ const TESTED: usize = 150;
 const REFUTED_SHARE: f32 = 0.1;
 /// Least share of the rim on the plane.
 const RIM_INLIERS: f32 = 0.15;
-/// Factor on the rim of a plane along an axis: most corners are right angles, and the rim often leaves
-/// the tilt about its front edge open.
+/// Factor on the rim of a plane along an axis: most corners are right angles, and the rim often
+/// leaves the tilt about its front edge open.
 const RIGHT_ANGLE: f32 = 1.2;
 /// The nearest plane counts of those with at least this share of the most pixels of the rim.
 const NEAREST_OF: f32 = 0.4;

@@ -57,7 +57,7 @@ impl CameraOrbit {
     pub fn new(photos: &[Camera], target: DVec3, up: DVec3) -> CameraOrbit {
         let offsets: Vec<DVec3> = photos.iter().map(|c| c.pose.centre() - target).collect();
         let horizontal = |v: DVec3| v - up * v.dot(up);
-        // Azimuths are relative to the mean direction, so that the gap behind the photos is at ±180°.
+        // Azimuths are relative to the mean direction: the gap behind the photos is at ±180°.
         let mean = offsets.iter().map(|o| horizontal(*o).normalize_or_zero()).sum::<DVec3>();
         let front = if mean.length() > 1e-6 {
             mean.normalize()
@@ -107,10 +107,10 @@ impl CameraOrbit {
             .collect()
     }
 
-    /// Cameras of a video from left to right through all photos, with `per_segment` frames from each
-    /// photo to the next. With `beyond` it starts 20° to the left of the photos, ends 20° to the
-    /// right, and then shows the other views of [`CameraOrbit::beyond`]. All frames have the size of
-    /// the first photo.
+    /// Cameras of a video from left to right through all photos, with `per_segment` frames from
+    /// each photo to the next. With `beyond` it starts 20° to the left of the photos, ends 20° to
+    /// the right, and then shows the other views of [`CameraOrbit::beyond`]. All frames have the
+    /// size of the first photo.
     pub fn video(&self, beyond: bool, per_segment: usize) -> Vec<Camera> {
         let Some(first) = self.photos.first() else { return Vec::new() };
         let mut stops = self.photos.clone();
@@ -156,8 +156,8 @@ impl CameraOrbit {
         }
     }
 
-    /// A camera turned about the target: `azimuth` degrees to the right of a person who looks at it,
-    /// `elevation` degrees upwards, at a factor of the distance.
+    /// A camera turned about the target: `azimuth` degrees to the right of a person who looks at
+    /// it, `elevation` degrees upwards, at a factor of the distance.
     pub fn displaced(&self, camera: &Camera, azimuth: f64, elevation: f64, distance: f64) -> Camera {
         let offset = camera.pose.centre() - self.target;
         let right = self.up.cross(offset).normalize_or(self.up.any_orthonormal_vector());
