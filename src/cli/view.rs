@@ -46,13 +46,13 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     };
     let address = server.url();
     let questions = serve(server, site)?;
+    // From here on stopping leaves nothing undone. Whoever reads the address may stop the server.
+    progress::stop_without_error();
     if args.device.json {
         print_json(&json!({ "address": address, "scene": args.scene, "questions": ready.is_some() }))?;
     } else {
         print(&format!("{} is at {address}  (Ctrl-C ends)\n", args.scene.display()))?;
     }
-    // From here on stopping leaves nothing undone, even while a question is answered.
-    progress::stop_without_error();
     let input = StandardInput::new();
     while !progress::stopped() && !input.has_closed() {
         match questions.recv_timeout(POLL_INTERVAL) {
