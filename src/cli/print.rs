@@ -24,14 +24,14 @@ pub fn print_json(value: &serde_json::Value) -> Result<()> {
     put(&format!("{value}\n"))
 }
 
-/// Lines after a scene was made, to copy: path of its report, and the command that shows it.
+/// Last two lines after a scene was made, to copy whole: path of its report, and the command that
+/// shows it.
 pub fn ending(scene: &Path) -> String {
-    let report = scene.join("report.html");
-    format!("report: {}\nlook at it: splatvk view {}\n", report.display(), quoted(scene))
+    format!("{}\nsplatvk view {}\n", quoted(&scene.join("report.html")), quoted(scene))
 }
 
 /// A path in the quotes of a shell.
-fn quoted(path: &Path) -> String {
+pub fn quoted(path: &Path) -> String {
     let text = path.display().to_string();
     let plain = |c: char| c.is_alphanumeric() || "/._-+,:@%".contains(c);
     if text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', "'\\''")) }
@@ -53,8 +53,11 @@ mod tests {
     fn ending_quotes_paths_for_shell() {
         assert_eq!(
             ending(Path::new("out/tree")),
-            "report: out/tree/report.html\nlook at it: splatvk view out/tree\n"
+            "out/tree/report.html\nsplatvk view out/tree\n"
         );
-        assert!(ending(Path::new("it's a tree")).ends_with("view 'it'\\''s a tree'\n"));
+        assert_eq!(
+            ending(Path::new("it's a tree")),
+            "'it'\\''s a tree/report.html'\nsplatvk view 'it'\\''s a tree'\n"
+        );
     }
 }

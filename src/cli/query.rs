@@ -213,6 +213,7 @@ fn short_table(texts: &[TextAnswers]) -> String {
         rows.push([
             text,
             match answers.presence {
+                _ if answers.reading.is_unknown() => "unknown words".to_owned(),
                 Some(Presence::Absent) => "not in this scene".to_owned(),
                 Some(Presence::Unsure) => "unsure".to_owned(),
                 Some(Presence::Found) | None if best.is_none() => "not found".to_owned(),
@@ -247,7 +248,7 @@ fn table(texts: &[TextAnswers], stems: &[String], folder: &Path) -> String {
     for TextAnswers { answers, views, milliseconds } in texts {
         let Some(answers) = answers else { continue };
         let found = views.iter().filter(|v| v["found"] == true).count();
-        let verdict = answer::verdict(answers.presence, found, views.len());
+        let verdict = answer::verdict(answers.presence, &answers.reading, found, views.len());
         let notes: String = answers.reading.notes().iter().map(|note| format!("; {note}")).collect();
         let summary = one_line(&format!("“{}”: {verdict}{notes}", answers.text));
         let _ = writeln!(text, "{summary}; answered in {milliseconds:.0} ms");

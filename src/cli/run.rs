@@ -60,13 +60,14 @@ pub fn run(args: &RunArgs) -> Result<()> {
     let plan = plan(args, &inventory(&args.device.registry()?))?;
     let progress = progress::reporter();
     let outcome = crate::run::run(&plan, progress.as_ref())?;
+    // Before the lines to copy, which are to be the last.
+    report_kept_stages(progress.as_ref());
     if args.device.json {
         let record = serde_json::to_value(crate::run::run_record(&outcome));
         print_json(&record.map_err(|e| Error::work(format!("run record: {e}")))?)?;
     } else {
         print(&(crate::run::closing_table(&outcome) + &ending(&outcome.plan.output.out)))?;
     }
-    report_kept_stages(progress.as_ref());
     Ok(())
 }
 

@@ -29,6 +29,7 @@ pub fn train(args: &TrainArgs) -> Result<()> {
     };
     let progress = progress::reporter();
     let outcome = run::run(&plan, progress.as_ref())?;
+    report_kept_stages(progress.as_ref());
     match args.device.json {
         true => {
             let record = serde_json::to_value(run::run_record(&outcome));
@@ -37,6 +38,5 @@ pub fn train(args: &TrainArgs) -> Result<()> {
         }
         false => print(&(run::closing_table(&outcome) + &ending(&plan.output.out)))?,
     }
-    report_kept_stages(progress.as_ref());
     Ok(())
 }

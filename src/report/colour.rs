@@ -61,15 +61,6 @@ fn map<T: Copy>(plane: &Image<T>, colour: impl Fn(T) -> [f32; 3]) -> RgbImage {
 /// gets a white outline.
 pub fn heat_image(picture: &RgbImage, relevancy: &Image<f32>, mask: Option<&Image<bool>>) -> RgbImage {
     let luma = picture.luma();
-    let edge = |x: usize, y: usize| {
-        mask.is_some_and(|m| {
-            m.at(x, y)
-                && (x == 0 || y == 0 || x + 1 == m.width || y + 1 == m.height || {
-                    let around = [(x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)];
-                    around.iter().any(|&(i, j)| !m.at(i, j))
-                })
-        })
-    };
     let mut data = Vec::with_capacity(relevancy.data.len());
     for y in 0..relevancy.height {
         for x in 0..relevancy.width {
@@ -79,10 +70,36 @@ pub fn heat_image(picture: &RgbImage, relevancy: &Image<f32>, mask: Option<&Imag
             let (base, hot) = (0.25 + 0.5 * luma.at(x, y), turbo(0.45 + 0.5 * heat));
             let share = 0.85 * heat;
             let colour = hot.map(|h| base * (1.0 - share) + h * share);
-            data.push(if edge(x, y) { [1.0; 3] } else { colour });
+            data.push(if on_edge(mask, x, y) { [1.0; 3] } else { colour });
         }
     }
     RgbImage { width: relevancy.width, height: relevancy.height, data }
+}
+
+/// Whether a pixel is the outermost of a mask.
+fn on_edge(mask: Option<&Image<bool>>, x: usize, y: usize) -> bool {
+    mask.is_some_and(|m| {
+        m.at(x, y)
+            && (x == 0 || y == 0 || x + 1 == m.width || y + 1 == m.height || {
+                let around = [(x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)];
+                around.iter().any(|&(i, j)| !m.at(i, j))
+            })
+    })
+}
+
+/// A picture with a white outline around the mask; without colour and darker outside of it.
+pub fn outline_image(picture: &RgbImage, mask: Option<&Image<bool>>) -> RgbImage {
+    let luma = picture.luma();
+    let colour = |i: usize| {
+        let (x, y) = (i % picture.width, i / picture.width);
+        match mask {
+            _ if on_edge(mask, x, y) => [1.0; 3],
+            Some(m) if m.at(x, y) => picture.data[i],
+            _ => [0.25 + 0.5 * luma.at(x, y); 3],
+        }
+    };
+    let data = (0..picture.data.len()).map(colour).collect();
+    RgbImage { width: picture.width, height: picture.height, data }
 }
 
 #[cfg(test)]
@@ -132,5 +149,8 @@ mod tests {
         assert_eq!(out.at(1, 1), [1.0; 3]);
         let (cold, hot) = (out.at(0, 0), out.at(2, 2));
         assert!(cold[0] == cold[2] && hot[0] > hot[2] + 0.3, "{cold:?} {hot:?}");
+        let out = outline_image(&picture, Some(&mask));
+        assert_eq!((out.at(1, 1), out.at(2, 2)), ([1.0; 3], [0.2, 0.4, 0.6]));
+        assert_eq!(out.at(0, 0), outline_image(&picture, None).at(2, 2));
     }
 }

@@ -115,12 +115,19 @@ pub struct AnswerShown<'a> {
     pub relevancy: &'a Image<f32>,
     /// [H, W] mask.
     pub mask: Option<&'a Image<bool>>,
-    /// Best relevancy.
-    pub score: f32,
-    /// Whether the score reached the threshold.
+    /// Whether the view shows it.
     pub found: bool,
-    /// Name of the level that answered.
-    pub level: &'a str,
+}
+
+/// How sure an answer is, for its colour on the page.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Certainty {
+    /// The thing is there.
+    Found,
+    /// The masks may show something else.
+    Unsure,
+    /// No view shows it.
+    Nothing,
 }
 
 /// Query with its answers.
@@ -130,8 +137,35 @@ pub struct QueryShown<'a> {
     pub text: &'a str,
     /// Answer in a few words.
     pub verdict: String,
+    /// How sure it is.
+    pub certainty: Certainty,
     /// One per view.
     pub answers: Vec<AnswerShown<'a>>,
+}
+
+/// Figure of a run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Figure {
+    /// Short name.
+    pub label: &'static str,
+    /// Value with its unit.
+    pub value: String,
+    /// A sentence that says what it means.
+    pub meaning: &'static str,
+    /// Whether a reader needs it to judge the scene; the others are folded in the report.
+    pub matters: bool,
+}
+
+impl Figure {
+    /// A figure that is folded in the report.
+    pub fn new(label: &'static str, value: String, meaning: &'static str) -> Figure {
+        Figure { label, value, meaning, matters: false }
+    }
+
+    /// A figure that the report shows at once.
+    pub fn that_matters(label: &'static str, value: String, meaning: &'static str) -> Figure {
+        Figure { label, value, meaning, matters: true }
+    }
 }
 
 /// Figure over the optimisation steps of a stage.
@@ -160,8 +194,8 @@ pub struct HtmlReport<'a> {
     pub space: Option<&'a str>,
     /// Scene for the interactive view.
     pub scene: Option<viewer::Scene3d<'a>>,
-    /// Figures for the head of the page: (label, value).
-    pub figures: Vec<(String, String)>,
+    /// Figures with their meaning.
+    pub figures: Vec<Figure>,
     /// Run record.
     pub run: &'a RunRecord,
 }

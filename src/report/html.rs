@@ -1,7 +1,7 @@
 //! `report.html`, one self-contained file, readable on a phone.
 use super::chart::escape;
 use super::{
-    AnswerShown, Curve, HtmlReport, Picture, QueryShown, ViewShown, chart, duration, one_line, viewer,
+    AnswerShown, Certainty, HtmlReport, Picture, QueryShown, ViewShown, figures, one_line, viewer,
 };
 use crate::format::picture;
 use crate::scene::RgbImage;
@@ -36,9 +36,9 @@ fn figure(image: &RgbImage, caption: &str) -> Result<String> {
 
 fn page(report: &HtmlReport) -> Result<String> {
     // The splats and the pictures take most of the time.
-    let (scene, (queries, views)) = rayon::join(
+    let (scene, (words, views)) = rayon::join(
         || report.scene.as_ref().map(|scene| scene.embedded()).transpose(),
-        || rayon::join(|| queries(report), || joined(report.views.par_iter().map(view_row))),
+        || rayon::join(|| words(report), || joined(report.views.par_iter().map(view_row))),
     );
     let title = escape(report.title);
     let mut body = format!("<header><h1>{title}</h1><p>{}</p></header>", escape(&report.run.program));
@@ -50,21 +50,11 @@ fn page(report: &HtmlReport) -> Result<String> {
     if let Some((section, note)) = scene? {
         let _ = write!(body, "{section}<p class=\"small\">{}</p>", escape(&note));
     }
-    body.push_str(&queries?);
-    body.push_str("<section><h2>Views</h2>");
+    body.push_str(&words?);
+    body.push_str("<section><h2>Photos</h2>");
     body.push_str(&views?);
     body.push_str("</section>");
-    body.push_str("<section><h2>Figures</h2><dl class=\"figures\">");
-    // The device is below the times, and answers have their own section.
-    for (label, value) in report.figures.iter().filter(|(l, _)| l != "device" && !l.starts_with('“')) {
-        let _ = write!(body, "<dt>{}</dt><dd>{}</dd>", escape(label), escape(value));
-    }
-    body.push_str("</dl></section>");
-    let charts: String = report.curves.iter().map(curve).collect();
-    if !charts.is_empty() {
-        let _ = write!(body, "<section><h2>Training</h2><div class=\"row curves\">{charts}</div></section>");
-    }
-    body.push_str(&run_tables(report));
+    body.push_str(&figures::section(report));
     Ok(format!(
         "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" \
          content=\"width=device-width, initial-scale=1\"><title>{title} · splatvk</title><style>{STYLE}{}</style>\
@@ -73,39 +63,42 @@ fn page(report: &HtmlReport) -> Result<String> {
     ))
 }
 
-/// Chart of a curve with its last value in the caption; empty for a curve without two points.
-fn curve(curve: &Curve) -> String {
-    let svg = chart::line_chart(&curve.points, "step", curve.name);
-    let (Some((_, last)), false) = (curve.points.last(), svg.is_empty()) else { return String::new() };
-    let decimals = if last.abs() >= 1000.0 { 0 } else { 2 + usize::from(last.abs() < 1.0) };
-    let unit = if curve.unit.is_empty() { String::new() } else { format!(" {}", curve.unit) };
-    format!("<figure>{svg}<figcaption>at the end {last:.decimals$}{unit}</figcaption></figure>")
-}
-
+/// A photo beside its render; depth and levels are folded.
 fn view_row(v: &ViewShown) -> Result<String> {
     let light = match v.light.is_none() {
         true => String::new(),
         false => format!(", evened out: {}", v.light.summary()),
     };
-    let mut pictures = vec![(Picture::Plain(v.photo), format!("photo{light}"))];
+    let mut pair = vec![(Picture::Plain(v.photo), format!("photo{light}"))];
     if let Some(render) = v.render {
-        let caption = v.psnr.map_or("render".to_string(), |p| format!("render, {p:.1} dB"));
-        pictures.push((Picture::Plain(render), caption));
+        let caption = v.psnr.map_or("the scene".to_string(), |p| format!("the scene, PSNR {p:.1} dB"));
+        pair.push((Picture::Plain(render), caption));
     }
+    let mut more = Vec::new();
     if let Some(depth) = v.depth {
-        pictures.push((Picture::Depth(depth), "depth (near is warm)".to_owned()));
+        more.push((Picture::Depth(depth), "depth (near is warm)".to_owned()));
     }
     for (level, codes) in v.levels {
         let long = match *level {
             "s" => "subparts",
             "m" => "parts",
-            "l" => "whole things",
+            "l" => "things",
             other => other,
         };
-        pictures.push((Picture::Labels(codes), long.to_owned()));
+        more.push((Picture::Labels(codes), long.to_owned()));
     }
-    let figures = joined(pictures.par_iter().map(|(picture, caption)| figure(&picture.image(), caption)))?;
-    Ok(format!("<h3>{}</h3><div class=\"row views\">{figures}</div>", escape(v.name)))
+    let figures = |pictures: &[(Picture, String)]| {
+        joined(pictures.par_iter().map(|(picture, caption)| figure(&picture.image(), caption)))
+    };
+    let folded = match more.is_empty() {
+        true => String::new(),
+        false => format!(
+            "<details><summary>Depth and parts</summary><div class=\"row\">{}</div></details>",
+            figures(&more)?
+        ),
+    };
+    let name = escape(v.name);
+    Ok(format!("<h3>{name}</h3><div class=\"row pair\">{}</div>{folded}", figures(&pair)?))
 }
 
 /// The parts in their order, or the first error.
@@ -113,94 +106,65 @@ fn joined(parts: impl IndexedParallelIterator<Item = Result<String>>) -> Result<
     parts.collect::<Vec<_>>().into_iter().collect()
 }
 
-fn queries(report: &HtmlReport) -> Result<String> {
+/// Answers of the run, the things to click, which the viewer's script lists, and what the words
+/// are.
+fn words(report: &HtmlReport) -> Result<String> {
     let mut out = String::new();
-    if report.space.is_some_and(|s| s.starts_with("words")) {
+    if !report.queries.is_empty() {
+        out.push_str("<section><h2>Words</h2>");
+        out.push_str(&joined(report.queries.par_iter().map(|q| query_row(report, q)))?);
+        out.push_str("</section>");
+    }
+    if report.scene.is_some() && report.space.is_some() {
         out.push_str(
-            "<section class=\"note\"><p>Words come from the built-in model: an image classifier that knows about a thousand \
-             everyday things, joined to texts through a small sentence model. It is a light stand-in; CLIP is the full \
-             model. A thing outside its thousand classes may be confused with its nearest relative.</p></section>",
+            "<section id=\"v-things\" hidden><h2>Things</h2><p class=\"small\">What the scene is divided into, \
+             largest first. Click one, here or in the scene. It has a name only where one is clear.</p>\
+             <div class=\"things\"></div></section>",
         );
     }
-    if report.queries.is_empty() {
-        return Ok(out);
+    if report.space.is_some_and(|s| s.starts_with("words")) {
+        out.push_str(
+            "<p class=\"small\">Words come from the built-in model: an image classifier that knows about a thousand \
+             everyday things, joined to texts through a small sentence model. It is a light stand-in; CLIP is the full \
+             model. A thing outside its thousand classes may be confused with its nearest relative.</p>",
+        );
     }
-    out.push_str("<section><h2>Queries</h2>");
-    out.push_str(&joined(report.queries.par_iter().map(|q| query_row(report, q)))?);
-    out.push_str("</section>");
     Ok(out)
 }
 
 fn query_row(report: &HtmlReport, q: &QueryShown) -> Result<String> {
-    let hits = q.answers.iter().filter(|a| a.found).count();
-    let class = if hits > 0 { "yes" } else { "no" };
+    let class = match q.certainty {
+        Certainty::Found => "yes",
+        Certainty::Unsure => "unsure",
+        Certainty::Nothing => "no",
+    };
     let heat = |a: &AnswerShown| {
         let Some(view) = report.views.get(a.view) else { return Ok(String::new()) };
-        let verdict = if a.found { "" } else { ", not found" };
-        let caption = format!("{}: {:.2} at level {}{verdict}", view.name, a.score, a.level);
-        figure(&Picture::Heat(view.photo, a).image(), &caption)
+        let (picture, what) = match (q.certainty, a.found) {
+            (Certainty::Nothing, _) => (Picture::Heat(view.photo, a), "nearest is warm"),
+            (_, false) => (Picture::Outline(view.photo, None), "not seen"),
+            (Certainty::Unsure, true) => (Picture::Outline(view.photo, a.mask), "perhaps what is outlined"),
+            (Certainty::Found, true) => (Picture::Heat(view.photo, a), "outlined"),
+        };
+        figure(&picture.image(), &format!("{}: {what}", view.name))
     };
     let figures = joined(q.answers.par_iter().map(heat))?;
+    let mut row = format!("<div class=\"row\">{figures}</div>");
+    if q.certainty == Certainty::Nothing {
+        row = format!("<details><summary>What is nearest to these words</summary>{row}</details>");
+    }
+    let text = escape(&one_line(q.text));
     Ok(format!(
-        "<h3>“{}” <span class=\"{class}\">{}</span></h3><div class=\"row\">{figures}</div>",
-        escape(&one_line(q.text)),
+        "<h3><button type=\"button\" data-ask=\"{}\" title=\"Show it in the scene\">“{text}”</button> \
+         <span class=\"{class}\">{}</span></h3>{row}",
+        escape(q.text),
         escape(&q.verdict)
     ))
 }
 
-fn run_tables(report: &HtmlReport) -> String {
-    let run = report.run;
-    let mut out = String::from(
-        "<section><h2>Time and memory</h2><table class=\"time\"><tr><th>stage<th>time; bars show when<th>peak memory</tr>",
-    );
-    let percent = |seconds: f64| seconds / run.seconds.max(1e-9) * 100.0;
-    for s in &run.stages {
-        let memory =
-            if s.peak_memory > 0 { format!("{:.2} GB", s.peak_memory as f64 / 1e9) } else { "–".into() };
-        let (from, share) = (percent(s.start), percent(s.seconds));
-        // Writing to a String cannot fail.
-        let _ = write!(
-            out,
-            "<tr><td>{}<td>{}<i style=\"margin-left:{from:.1}%;width:{share:.1}%\"></i><td>{memory}</tr>",
-            escape(&s.name),
-            duration(s.seconds)
-        );
-    }
-    let kind = if run.device_is_cpu { " (computes on the CPU)" } else { "" };
-    let _ = write!(
-        out,
-        "<tr><td>total<td>{}<td></tr></table><p>Vulkan device: {}{kind}. Seed {}.</p>",
-        duration(run.seconds),
-        escape(&run.device),
-        run.seed
-    );
-    if !run.models.is_empty() {
-        out.push_str("<h2>Models</h2><table><tr><th>model<th>licence<th>sha256</tr>");
-        for m in &run.models {
-            let _ = write!(
-                out,
-                "<tr><td>{}<td>{}<td><code>{}</code></tr>",
-                escape(&m.name),
-                escape(&m.licence),
-                escape(&m.sha256)
-            );
-        }
-        out.push_str("</table>");
-    }
-    let settings = serde_json::to_string_pretty(&run.config).unwrap_or_default();
-    let statistics = serde_json::to_string_pretty(&run.statistics).unwrap_or_default();
-    let _ = write!(out, "<details><summary>Settings</summary><pre>{}</pre></details>", escape(&settings));
-    let _ = write!(
-        out,
-        "<details><summary>Statistics</summary><pre>{}</pre></details></section>",
-        escape(&statistics)
-    );
-    out
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::RunRecord;
+    use super::super::{Curve, Figure, RunRecord};
     use super::*;
     use crate::photo::Light;
     use crate::progress::StageRecord;
@@ -237,23 +201,32 @@ mod tests {
             psnr: Some(31.25),
             light: Light { gain: [1.2; 3], ..Light::NONE },
         };
-        let answer =
-            AnswerShown { view: 0, relevancy: &relevancy, mask: None, score: 0.9, found: true, level: "l" };
+        let mask = Image::filled(8, 6, true);
+        let answer = |found| AnswerShown { view: 0, relevancy: &relevancy, mask: Some(&mask), found };
+        let query = |text, verdict: &str, certainty| QueryShown {
+            text,
+            verdict: verdict.into(),
+            certainty,
+            answers: vec![answer(certainty != Certainty::Nothing)],
+        };
         let report = HtmlReport {
             title: "a <b> & \"c\"",
             views: vec![view],
-            queries: vec![QueryShown {
-                text: "<script>",
-                verdict: "found in 1 of 1 photos".into(),
-                answers: vec![answer],
-            }],
+            queries: vec![
+                query("<script>", "found in 1 of 1 photos", Certainty::Found),
+                query("tree", "unsure; if it is here, in 1 of 1 photos", Certainty::Unsure),
+                query("moon", "not in this scene", Certainty::Nothing),
+            ],
             curves: vec![
                 Curve { name: "PSNR", unit: "dB", points: vec![(1.0, 21.0), (100.0, 32.456)] },
                 Curve { name: "nothing", unit: "", points: vec![(1.0, 1.0)] },
             ],
             space: Some("words/x"),
             scene: None,
-            figures: vec![("splats".into(), "123".into())],
+            figures: vec![
+                Figure::new("splats", "123".into(), "How many."),
+                Figure::that_matters("cameras", "high confidence".into(), "Where the photos stand."),
+            ],
             run: &run,
         };
         let folder = tempfile::tempdir().unwrap();
@@ -261,8 +234,8 @@ mod tests {
         super::super::write_previews(folder.path(), &report).unwrap();
         run.write(folder.path()).unwrap();
         let html = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
-        // Photo, render, depth, one level, one heat map; no requests; user text is escaped.
-        assert_eq!(html.matches("data:image/jpeg;base64,").count(), 5);
+        // Photo, render, depth, one level, three answers; no requests; user text is escaped.
+        assert_eq!(html.matches("data:image/jpeg;base64,").count(), 7);
         assert!(!html.contains("http") && !html.contains("<script>") && html.contains("&lt;script&gt;"));
         for text in [
             "31.2 dB",
@@ -273,9 +246,19 @@ mod tests {
             "1.07 GB",
             "found in 1 of 1",
             "at the end 32.46 dB",
+            "class=\"yes\">found",
+            "class=\"unsure\">unsure; if it is here",
+            "a: perhaps what is outlined",
+            "class=\"no\">not in this scene",
+            "Where the photos stand.",
         ] {
             assert!(html.contains(text), "{text}");
         }
+        // Words, photos, figures; what does not matter is folded.
+        let at = |text: &str| html.find(text).unwrap_or_else(|| panic!("{text}"));
+        let order = ["<h2>Words", "thousand everyday", "<h2>Photos", "<h2>Figures", "<dt>cameras", "<dt>splats"];
+        assert!(order.windows(2).all(|pair| at(pair[0]) < at(pair[1])));
+        assert!(at("<summary>More figures") < at("<dt>splats") && at("<dt>cameras") < at("<summary>More figures"));
         assert_eq!(html.matches("<svg").count(), 1, "a single point is no curve");
         for name in ["a_render.jpg", "a_depth.jpg", "a_level_l.jpg", "query__script__a.jpg"] {
             assert!(image::open(folder.path().join("previews").join(name)).is_ok(), "{name}");

@@ -3,12 +3,15 @@ mod bare;
 pub mod chart;
 pub mod colour;
 mod contents;
+mod figures;
 mod html;
 mod line;
 mod summary;
 pub mod viewer;
 
-pub use contents::{AnswerShown, Curve, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown};
+pub use contents::{
+    AnswerShown, Certainty, Curve, Figure, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown,
+};
 pub use html::write_html;
 pub use line::{one_line, visible};
 pub use summary::{duration, table};
@@ -30,6 +33,8 @@ enum Picture<'a> {
     Labels(&'a Image<i32>),
     /// Answer to a query, over its photo.
     Heat(&'a RgbImage, &'a AnswerShown<'a>),
+    /// An unsure answer: its outline only, since heat reads as a find.
+    Outline(&'a RgbImage, Option<&'a Image<bool>>),
 }
 
 impl Picture<'_> {
@@ -41,6 +46,7 @@ impl Picture<'_> {
             Picture::Heat(photo, answer) => {
                 Cow::Owned(colour::heat_image(photo, answer.relevancy, answer.mask))
             }
+            Picture::Outline(photo, mask) => Cow::Owned(colour::outline_image(photo, *mask)),
         }
     }
 }

@@ -4,7 +4,7 @@ use super::view::DecodedFrame;
 use crate::Result;
 use crate::query::highlight::{Highlight, highlight};
 use crate::query::instances::{Instance, Places};
-use crate::query::phrasing::Reading;
+use crate::query::phrasing::{Phrasing, Reading};
 use crate::query::presence::{Background, Evidence, Presence, ShownCodes, ShownPixels};
 use crate::query::select::{Selection, select};
 use crate::query::{self, QueryOptions, QueryResult, TextQuery};
@@ -42,7 +42,8 @@ pub struct Answers {
     pub reliability: Option<f64>,
     /// `reliability` of the part that each view shows.
     pub view_reliability: Vec<Option<f64>>,
-    /// Splats of the answer, independent of the views; none for an absent text.
+    /// Splats of the answer, independent of the views; none for an absent text, nor for an unknown
+    /// one that fits nothing.
     pub selection: Selection,
     /// Things of the answer, largest first; none for an absent text.
     pub instances: Vec<Instance>,
@@ -58,7 +59,8 @@ impl Answers {
             found: self.found(),
             views: self.views.len(),
             presence: self.presence,
-            notes: self.reading.notes(),
+            verdict: self.verdict(),
+            notes: self.remarks(),
             highlight: &self.highlight,
         }
     }
@@ -70,12 +72,17 @@ impl Answers {
 
     /// The answer in a few words.
     pub fn verdict(&self) -> String {
-        verdict(self.presence, self.found(), self.views.len())
+        verdict(self.presence, &self.reading, self.found(), self.views.len())
     }
 
     /// The verdict, with the parts of the text that are not understood.
     pub fn sentence(&self) -> String {
-        std::iter::once(self.verdict()).chain(self.reading.notes()).collect::<Vec<_>>().join("; ")
+        std::iter::once(self.verdict()).chain(self.remarks()).collect::<Vec<_>>().join("; ")
+    }
+
+    /// Notes that the verdict does not contain.
+    fn remarks(&self) -> Vec<String> {
+        self.reading.phrasing.iter().map(Phrasing::note).collect()
     }
 
     /// Record of the text and its instances, as in `query --json` and run.json; `views` are the
@@ -116,8 +123,12 @@ fn placement_json(i: &Instance, unit: f64) -> Value {
 }
 
 /// An answer in a few words: "found in 3 of 4 photos".
-pub fn verdict(presence: Option<Presence>, found: usize, views: usize) -> String {
+pub fn verdict(presence: Option<Presence>, reading: &Reading, found: usize, views: usize) -> String {
     match presence {
+        _ if reading.is_unknown() && found == 0 => {
+            "outside the vocabulary; whether it is here is unknown".to_owned()
+        }
+        _ if reading.is_unknown() => format!("outside the vocabulary; a guess in {found} of {views} photos"),
         Some(Presence::Absent) => "not in this scene".to_owned(),
         Some(Presence::Unsure) => format!("unsure; if it is here, in {found} of {views} photos"),
         Some(Presence::Found) | None => format!("found in {found} of {views} photos"),
@@ -150,16 +161,16 @@ impl Prepared {
         evidence.map(|e| if query.reading.is_doubtful() { e.in_doubt() } else { e })
     }
 
-    /// Splats of the answer to a text; none if it is absent.
+    /// Splats of the answer to a text; none if it does not fit the scene.
     fn select(
         &self,
         field: &LanguageField,
         query: &TextQuery,
-        presence: Option<Presence>,
+        fits: bool,
         options: &QueryOptions,
     ) -> Result<Selection> {
         let mut selection = select(field, &self.places, query, options)?;
-        if presence == Some(Presence::Absent) {
+        if !fits {
             selection.splats.clear();
             selection.found = false;
         }
@@ -178,13 +189,17 @@ impl Prepared {
         let evidence = self.evidence(field, query, background);
         // Without evidence an unclear text is unsure.
         let doubt = query.reading.is_doubtful().then_some(Presence::Unsure);
-        let presence = evidence.map(|e| e.presence).or(doubt);
+        let fits = evidence.is_none_or(|e| e.presence != Presence::Absent);
+        let presence = match query.reading.is_unknown() {
+            true => doubt,
+            false => evidence.map(|e| e.presence).or(doubt),
+        };
         let codes: Vec<&[Image<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
         let mut views = query::answer_all(&codes, field, query, options)?;
-        for view in views.iter_mut().filter(|v| presence == Some(Presence::Absent) || !v.found) {
+        for view in views.iter_mut().filter(|v| !fits || !v.found) {
             view.mark_not_found();
         }
-        let selection = self.select(field, query, presence, options)?;
+        let selection = self.select(field, query, fits, options)?;
         let mut instances = match selection.found {
             true => self.places.instances(&selection.splats, selection.level),
             false => Vec::new(),
@@ -221,7 +236,7 @@ mod tests {
     use crate::infer::things;
     use crate::pass::RenderedFrame;
     use crate::query::CANONICAL_PHRASES;
-    use crate::query::phrasing::{Phrasing, Vocabulary};
+    use crate::query::phrasing::Vocabulary;
     use crate::query::presence::Alternatives;
     use crate::scene::{Codebook, LevelField, Pose, Scale};
     use glam::DVec3;
@@ -395,16 +410,34 @@ mod tests {
                 Reading { phrasing: Some(cut), vocabulary: None },
                 "answers for “lemon”; “on the plate” is not understood",
             ),
-            (Reading { phrasing: None, vocabulary: Some(unknown) }, "outside vocabulary; nearest: “orange”"),
+            (Reading { phrasing: None, vocabulary: Some(unknown) }, "outside the vocabulary; nearest: “orange”"),
         ] {
             let a = wall.ask("lemon", reading);
-            assert_eq!(a.presence, Some(Presence::Unsure));
-            assert!(a.found() == 1 && a.sentence() == format!("{}; {note}", a.verdict()), "{}", a.sentence());
-            assert_eq!(a.shown().json()["notes"], json!([note]));
+            assert_eq!((a.presence, a.found()), (Some(Presence::Unsure), 1));
+            assert_eq!(a.reading.notes(), [note]);
+            match a.reading.is_unknown() {
+                true => assert_eq!(a.sentence(), "outside the vocabulary; a guess in 1 of 1 photos"),
+                false => {
+                    assert_eq!(a.sentence(), format!("{}; {note}", a.verdict()));
+                    assert_eq!(a.shown().json()["notes"], json!([note]));
+                }
+            }
             let record = a.record(&["a".into()], &World::default());
             let noted =
                 if a.reading.phrasing.is_some() { &record["phrasing"] } else { &record["vocabulary"] };
             assert!(noted["not_understood"] == "on the plate" || noted["nearest"] == "orange", "{record}");
         }
+    }
+
+    #[test]
+    fn unknown_text_without_fit_is_unsure_and_shows_nothing() {
+        let mut wall = wall();
+        wall.things = Arc::new(text_embedding("lemon").repeat(100));
+        let unknown = Vocabulary { known: false, nearest: "orange".into() };
+        let a = wall.ask("lemon", Reading { phrasing: None, vocabulary: Some(unknown) });
+        assert_eq!((a.presence, a.found(), a.instances.len()), (Some(Presence::Unsure), 0, 0));
+        assert_eq!(a.sentence(), "outside the vocabulary; whether it is here is unknown");
+        let page = a.shown().json();
+        assert!(page["verdict"] == a.verdict() && page["codes"] == json!([]), "{page}");
     }
 }

@@ -5,6 +5,7 @@ use crate::pass::metrics;
 use crate::photo::Photo;
 use crate::pose::Confidence;
 use crate::progress::{Progress, Recorded};
+use crate::report::Figure;
 use crate::scene::Coverage;
 use rayon::prelude::*;
 
@@ -33,10 +34,12 @@ fn masked_psnr(frame: &DecodedFrame, photo: &Photo) -> f64 {
 }
 
 /// Mean over the photos and their range, for the closing table.
-pub(super) fn figure(psnr: &[f64]) -> (String, String) {
+pub(super) fn figure(psnr: &[f64]) -> Figure {
     let (low, high) = range(psnr);
     let text = format!("{:.2} dB ({low:.1} to {high:.1})", mean(psnr));
-    ("train PSNR".to_owned(), text)
+    let meaning = "How closely the scene repeats its photos: 30 dB or more is good, below 22 dB the scene is doubtful. \
+                   It says nothing of places between the photos.";
+    Figure::that_matters("train PSNR", text, meaning)
 }
 
 /// Warns if the scene shows all of its photos badly, and names single photos that it shows badly.
@@ -140,6 +143,6 @@ mod tests {
 
     #[test]
     fn figure_states_mean_and_range() {
-        assert_eq!(figure(&[32.0, 34.0]).1, "33.00 dB (32.0 to 34.0)");
+        assert_eq!(figure(&[32.0, 34.0]).value, "33.00 dB (32.0 to 34.0)");
     }
 }

@@ -1,5 +1,6 @@
 //! Photometric correction of the photos, in run.json, the report and the closing table.
 use crate::photo::{Light, Photo};
+use crate::report::Figure;
 use serde_json::{Value, json};
 
 /// Entries of run.json per photo; `None` if no photo was corrected.
@@ -17,7 +18,7 @@ fn light_json(photo: &Photo) -> Value {
 }
 
 /// Line of the closing table: the range over the photos.
-pub(super) fn figure(photos: &[Photo]) -> Option<(String, String)> {
+pub(super) fn figure(photos: &[Photo]) -> Option<Figure> {
     if !any_corrected(photos) {
         return None;
     }
@@ -33,7 +34,7 @@ pub(super) fn figure(photos: &[Photo]) -> Option<(String, String)> {
         bright - dark,
         colour_percent(0).max(colour_percent(1)),
     );
-    Some(("light".to_owned(), text))
+    Some(Figure::new("light", text, "Differences of exposure, white balance and vignetting among the photos."))
 }
 
 /// Minimum and maximum of a figure over the photos.
@@ -69,7 +70,7 @@ mod tests {
         let json = record(&photos).unwrap();
         assert_eq!((&json[0]["exposure_ev"], &json[1]["photo"]), (&json!(0.0), &json!("b")));
         assert!((json[1]["corner"].as_f64().unwrap() - (-0.2f64).exp()).abs() < 1e-12);
-        let text = figure(&photos).unwrap().1;
+        let text = figure(&photos).unwrap().value;
         assert_eq!(text, "exposures 1.05 ± 0.04 EV apart, colours 10 %, corners −18 %: evened out");
     }
 }

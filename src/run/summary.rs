@@ -6,24 +6,26 @@ use crate::Result;
 use crate::fit::ViewDependence;
 use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
+use crate::query::presence::Presence;
 use crate::report::viewer::{CodeNames, Scene3d};
-use crate::report::{self, AnswerShown, HtmlReport, QueryShown, ViewShown};
+use crate::report::{self, AnswerShown, Certainty, Figure, HtmlReport, QueryShown, ViewShown};
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, Seen, Splats, World};
 use rayon::prelude::*;
 use std::path::Path;
 
 /// A line for every photo that joined a scene.
-fn added_figures(o: &RunOutcome) -> Vec<(String, String)> {
+fn added_figures(o: &RunOutcome) -> Vec<Figure> {
     if o.known == 0 {
         return Vec::new();
     }
     (o.known..o.photos.len()).map(|view| added_figure(o, view)).collect()
 }
 
-fn added_figure(o: &RunOutcome, view: usize) -> (String, String) {
+fn added_figure(o: &RunOutcome, view: usize) -> Figure {
     let confidence = confidence(&o.geometry.fitted[view], &o.psnr).name();
     let psnr = o.psnr.get(view).copied().unwrap_or(0.0);
-    ("added".to_owned(), format!("{}: {confidence} confidence, {psnr:.2} dB", o.photos[view].stem))
+    let value = format!("{}: {confidence} confidence, {psnr:.2} dB", o.photos[view].stem);
+    Figure::that_matters("added", value, "A photo that joined the scene: its camera, and its PSNR.")
 }
 
 /// Measured focal length of every camera id.
@@ -89,9 +91,8 @@ fn corner_distortion(photo: &Photo, camera: &Camera) -> f64 {
     photo.lens().distort(corner).length() / corner.length() - 1.0
 }
 
-/// Figures for the head of the report and the closing table: (label, value).
-fn figures(o: &RunOutcome) -> Vec<(String, String)> {
-    let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
+/// Figures of the report and the closing table.
+fn figures(o: &RunOutcome) -> Vec<Figure> {
     // The progress output and run.json list the choice with reasons.
     let mut chosen = o.choice.as_ref().map_or(String::new(), |c| {
         format!("; {} chosen of {}", c.used.len(), c.used.len() + c.left_out.len())
@@ -101,42 +102,59 @@ fn figures(o: &RunOutcome) -> Vec<(String, String)> {
         chosen += &format!("; left out: {}", names.join(", "));
     }
     let mut list = vec![
-        ("device".to_owned(), format!("{}{cpu}", o.device.name)),
-        ("photos".to_owned(), sizes(&o.photos) + &chosen),
-        splats_figure(&o.splats, &o.seen),
+        Figure::that_matters(
+            "photos",
+            sizes(&o.photos) + &chosen,
+            "The photos that the scene was made from, at the size they were worked on.",
+        ),
         super::fidelity::figure(&o.psnr),
     ];
-    list.extend(view_dependence_figure(&o.rgb.view_dependence));
+    list.extend(confidence_figure(&o.photos, &o.geometry.fitted, &o.psnr).map(|text| {
+        let meaning = "How well the photos agree on where they were taken. Below high, shapes and lengths may be wrong.";
+        Figure::that_matters("cameras", text, meaning)
+    }));
     list.extend(added_figures(o));
-    list.extend(
-        focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| ("focal length".to_owned(), text)),
-    );
-    list.extend(
-        confidence_figure(&o.photos, &o.geometry.fitted, &o.psnr).map(|text| ("cameras".to_owned(), text)),
-    );
-    list.extend(lens_figure(o).map(|text| ("lens".to_owned(), text)));
-    list.push(up_figure(&o.world));
-    list.extend(super::light::figure(&o.photos));
-    let Some(language) = &o.language else { return list };
-    let codes = |k: usize| language.field.levels.get(k).map_or(0, |l| l.codebook.len());
-    list.push(("things s/m/l".to_owned(), format!("{} / {} / {}", codes(0), codes(1), codes(2))));
-    for a in &language.answers {
-        list.push((format!("“{}”", report::one_line(&a.text)), a.verdict()));
+    if let Some(language) = &o.language {
+        let codes = |k: usize| language.field.levels.get(k).map_or(0, |l| l.codebook.len());
+        let text = format!("{}, of {} parts and {} subparts", codes(2), codes(1), codes(0));
+        let meaning = "What the scene is divided into. A click selects one; a thing may still be several that touch.";
+        list.push(Figure::that_matters("things", text, meaning));
     }
+    list.push(up_figure(&o.world));
+    list.push(splats_figure(&o.splats, &o.seen));
+    list.extend(view_dependence_figure(&o.rgb.view_dependence));
+    list.extend(focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| {
+        Figure::new("focal length", text, "Of the photos at their working size, with one standard deviation.")
+    }));
+    list.extend(lens_figure(o).map(|text| {
+        Figure::new("lens", text, "Radial distortion k1, k2 and offset of the principal point, as estimated.")
+    }));
+    list.extend(super::light::figure(&o.photos));
     list
 }
 
+/// Lines of the closing table: figures, device, and the answers last.
+fn closing_lines(o: &RunOutcome) -> Vec<(String, String)> {
+    let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
+    let device = std::iter::once(("device".to_owned(), format!("{}{cpu}", o.device.name)));
+    let figures = figures(o).into_iter().map(|f| (f.label.to_owned(), f.value));
+    let answers = o.language.iter().flat_map(|l| &l.answers);
+    let answers = answers.map(|a| (format!("“{}”", report::one_line(&a.text)), a.verdict()));
+    device.chain(figures).chain(answers).collect()
+}
+
 /// Number of splats, and how many of them are extrapolated.
-fn splats_figure(splats: &Splats, seen: &Seen) -> (String, String) {
+fn splats_figure(splats: &Splats, seen: &Seen) -> Figure {
     let unseen = match seen.unseen() {
         0 => String::new(),
         n => format!(", {n} of them where no photo looks"),
     };
-    ("splats".to_owned(), format!("{}{unseen}", splats.len()))
+    let meaning = "The soft dots that the scene consists of. Where no photo looks they are guessed.";
+    Figure::new("splats", format!("{}{unseen}", splats.len()), meaning)
 }
 
 /// SH degree of the colours unless it is 0, with the gain on photos left out.
-fn view_dependence_figure(found: &ViewDependence) -> Option<(String, String)> {
+fn view_dependence_figure(found: &ViewDependence) -> Option<Figure> {
     let text = match (found.degree, found.trials.last()) {
         (0, _) => return None,
         (degree, Some(t)) if t.supported() => {
@@ -144,19 +162,23 @@ fn view_dependence_figure(found: &ViewDependence) -> Option<(String, String)> {
         }
         (degree, _) => format!("SH degree {degree}"),
     };
-    Some(("colours".to_owned(), text))
+    Some(Figure::new("colours", text, "Colours depend on the direction, as on shiny things."))
 }
 
 /// Uncertainty of the direction up, with its evidence.
-fn up_figure(world: &World) -> (String, String) {
-    let text = match &world.up {
+fn up_figure(world: &World) -> Figure {
+    match &world.up {
         Some(up) => {
             let evidence: Vec<&str> = up.evidence.iter().map(|e| e.text()).collect();
-            format!("± {:.1}° ({})", up.sigma_degrees, evidence.join(", "))
+            let text = format!("± {:.1}° ({})", up.sigma_degrees, evidence.join(", "));
+            Figure::new("up", text, "How exactly the direction up is known, and from what.")
         }
-        None => "not known: too few edges and surfaces agree on one direction".to_owned(),
-    };
-    ("up".to_owned(), text)
+        None => Figure::that_matters(
+            "up",
+            "not known: too few edges and surfaces agree on one direction".to_owned(),
+            "The scene may stand tilted in other programs.",
+        ),
+    }
 }
 
 /// Number and sizes of the photos, with a hint if they were scaled down.
@@ -187,7 +209,7 @@ fn size_text(photo: &Photo) -> String {
 
 /// The table that ends `splatvk run`; a warning of doubtful quality precedes it.
 pub fn closing_table(o: &RunOutcome) -> String {
-    super::fidelity::heading(&o.psnr) + &report::table(&o.stages, o.seconds, &figures(o))
+    super::fidelity::heading(&o.psnr) + &report::table(&o.stages, o.seconds, &closing_lines(o))
 }
 
 /// Writes `run.json`, `report.html` and `previews/`.
@@ -254,12 +276,15 @@ fn shown(a: &Answers) -> QueryShown<'_> {
             view,
             relevancy: &v.relevancy,
             mask: Some(&v.mask),
-            score: v.score,
             found: v.found,
-            level: LEVEL_NAMES[v.level],
         })
         .collect();
-    QueryShown { text: &a.text, verdict: a.sentence(), answers }
+    let certainty = match a.presence {
+        _ if a.found() == 0 => Certainty::Nothing,
+        Some(Presence::Unsure) => Certainty::Unsure,
+        _ => Certainty::Found,
+    };
+    QueryShown { text: &a.text, verdict: a.sentence(), certainty, answers }
 }
 
 #[cfg(test)]

@@ -27,7 +27,7 @@ const REPORT_SPLATS: usize = 300_000;
 const THUMBNAIL: usize = 104;
 
 /// Import name and text of each module.
-const MODULES: [(&str, &str); 10] = [
+const MODULES: [(&str, &str); 11] = [
     ("splatvk/camera", include_str!("camera.js")),
     ("splatvk/controls", include_str!("controls.js")),
     ("splatvk/measure", include_str!("measure.js")),
@@ -37,6 +37,7 @@ const MODULES: [(&str, &str); 10] = [
     ("splatvk/render", include_str!("render.js")),
     ("splatvk/sort", include_str!("sort.js")),
     ("splatvk/splats", include_str!("splats.js")),
+    ("splatvk/things", include_str!("things.js")),
     ("splatvk/viewer", include_str!("viewer.js")),
 ];
 
@@ -56,6 +57,8 @@ pub struct ShownAnswer<'a> {
     pub views: usize,
     /// Presence in the scene, where it is known.
     pub presence: Option<Presence>,
+    /// Answer in a few words.
+    pub verdict: String,
     /// Remarks on parts of the text that were not understood.
     pub notes: Vec<String>,
     /// Highlighted codes.
@@ -68,7 +71,7 @@ impl ShownAnswer<'_> {
         let h = self.highlight;
         json!({
             "text": self.text, "found": self.found, "views": self.views, "presence": self.presence,
-            "notes": self.notes,
+            "verdict": self.verdict, "notes": self.notes,
             "level": h.level, "codes": h.codes, "relevancy": h.relevancy,
         })
     }
@@ -205,6 +208,7 @@ mod tests {
             found: 1,
             views: 1,
             presence: None,
+            verdict: "found in 1 of 1 photos".into(),
             notes: Vec::new(),
             highlight: &highlight,
         };

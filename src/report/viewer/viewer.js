@@ -8,6 +8,7 @@ import { isClear, namesOf, perhaps } from "splatvk/names";
 import { pick } from "splatvk/pick";
 import { Renderer } from "splatvk/render";
 import { download, extentOf, gunzip, medianDepth, unpack } from "splatvk/splats";
+import { connectPage } from "splatvk/things";
 
 const manifest = JSON.parse(document.getElementById("v-manifest").textContent);
 const root = document.querySelector(".viewer");
@@ -340,10 +341,8 @@ function setQuery(answer) {
     find(".v-ask input").value = answer.text;
     const of = (k) => answer.relevancy[answer.level][k];
     const best = answer.codes.reduce((a, b) => (of(b) > of(a) ? b : a), answer.codes[0]);
-    const where = `in ${answer.found} of ${answer.views} photos`;
-    const as = `, as a ${levels[answer.level].one.toLowerCase()}`;
-    const found = !answer.found ? "Not in this scene; the heat shows what is nearest"
-      : (answer.presence === "unsure" ? `Unsure; if it is here, ${where}` : `Found ${where}`) + as;
+    const as = answer.found ? `, as a ${levels[answer.level].one.toLowerCase()}` : "; the heat shows what is nearest";
+    const found = answer.verdict[0].toUpperCase() + answer.verdict.slice(1) + as;
     const notes = (answer.notes ?? []).map((note) => `; ${note}`).join("");
     const time = answer.milliseconds === undefined ? "" : `, ${answer.milliseconds.toFixed(0)} ms`;
     const names = best === undefined ? [] : namesOf(levels, answers, answer.level, best);
@@ -471,6 +470,9 @@ function connect() {
   form.hidden = find(".v-chips").hidden = !levels.some((l) => l.colours.length);
   form.elements.text.placeholder = manifest.live ? "Ask for something you see" : "Queries of the run";
   listQueries();
+  const toView = (act) => (...given) => (root.scrollIntoView({ block: "nearest" }), act(...given));
+  const selectCode = (level, code) => (setQuery(null), select(level, { codes: levels.map((_, at) => (at === level ? code : -1)) }));
+  connectPage({ splats, levels, answers }, { ask: toView(ask), select: toView(selectCode) });
   const fills = () => document.fullscreenElement === root || root.matches(".full, .wide");
   input = controls({ root, canvas, motion, actions, tap, tapsAtOnce: () => tape.active, surface, fills, nextMode, toggleGuessed, clear });
 }

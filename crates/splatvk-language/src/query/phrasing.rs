@@ -97,13 +97,19 @@ pub struct Reading {
 impl Reading {
     /// Whether the answer may be for something else.
     pub fn is_doubtful(&self) -> bool {
-        self.phrasing.is_some() || self.vocabulary.as_ref().is_some_and(|v| !v.known)
+        self.phrasing.is_some() || self.is_unknown()
+    }
+
+    /// Whether the text is outside of the model's vocabulary. Whether a scene shows it cannot be
+    /// told then: a poor fit of unknown words is no evidence of absence.
+    pub fn is_unknown(&self) -> bool {
+        self.vocabulary.as_ref().is_some_and(|v| !v.known)
     }
 
     /// Note for the user, one line each.
     pub fn notes(&self) -> Vec<String> {
         let unknown = self.vocabulary.as_ref().filter(|v| !v.known);
-        let unknown = unknown.map(|v| format!("outside vocabulary; nearest: “{}”", v.nearest));
+        let unknown = unknown.map(|v| format!("outside the vocabulary; nearest: “{}”", v.nearest));
         self.phrasing.as_ref().map(Phrasing::note).into_iter().chain(unknown).collect()
     }
 }
