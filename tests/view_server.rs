@@ -5,9 +5,10 @@ mod fixture;
 
 use fixture::view::{Server, breakfast};
 use serde_json::{Value, json};
+use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
 use std::path::PathBuf;
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
@@ -274,4 +275,46 @@ fn server_reports_taken_port() {
     let output = command.arg("view").arg(scene()).args(["--port", &port]).output().unwrap();
     assert_eq!(output.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&output.stderr).contains("--port"));
+}
+
+/// A run whose training outlasts the test. It is ended by its process number.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+fn view_of_running_run_is_a_preview() {
+    let (images, cameras, points) = fixture::small_views();
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("a scene");
+    let mut train = Command::new(env!("CARGO_BIN_EXE_splatvk"));
+    train.arg("train").arg("--images").arg(images).arg("--cameras").arg(cameras).arg("--points").arg(points);
+    train.args(["--iterations", "30000", "--log", "json", "--out"]).arg(&out).stderr(Stdio::piped());
+    let mut run = Running(train.spawn().unwrap());
+    let lines = BufReader::new(run.0.stderr.take().unwrap()).lines().map_while(Result::ok);
+    let mut events = lines.map(|line| serde_json::from_str::<Value>(&line).unwrap());
+    let offer = events.find(|e| e["message"].as_str().is_some_and(|m| m.contains("preview"))).unwrap();
+    assert_eq!(
+        offer["message"],
+        format!("look at a preview meanwhile: splatvk view '{}'", out.display()),
+        "to copy, in the quotes of a shell"
+    );
+    let step = events.find(|e| e["event"] == "step" && e["stage"] == "splats").unwrap();
+    // Photos, features, cameras, stereo and surfaces, which given cameras skip, and initial splats.
+    assert_eq!((&step["stage_number"], &step["stages"]), (&json!(7), &json!(10)));
+    assert!(step["seconds_left"].as_f64().unwrap() > 1.0, "{step}");
+    let server = Server::start(&out);
+    assert!(!out.exists(), "the scene comes later");
+    let (status, page) = server.request("GET", "", "", "");
+    assert!(status == 200 && page.contains("A preview: the scene is still being made"), "{status}");
+    drop(run);
+    assert_eq!(server.request("GET", "scene.bin", "", "").0, 200, "the preview stays in memory");
+    // A stopped run has no preview: the next command says that there is no scene.
+    let view = Command::new(env!("CARGO_BIN_EXE_splatvk")).arg("view").arg(&out).output().unwrap();
+    assert_eq!(view.status.code(), Some(2));
 }

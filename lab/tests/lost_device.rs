@@ -72,7 +72,7 @@ fn train(device: &Device, store: &Store) -> (splatvk::Result<Trained>, Vec<u64>)
     let priors = graph.add(DepthPriors::new(PriorOrigin::None).unwrap(), (placed,));
     let geometry = graph.add(DenseDepth { preset: Preset::Draft, seed: 0 }, (placed, priors));
     let options = RgbOptions::preset(Preset::Draft).with_iterations(STEPS);
-    let trained = graph.add(TrainColour { options }, (placed, geometry));
+    let trained = graph.add(TrainColour { options, preview: None }, (placed, geometry));
     let (steps, registry) = (Steps::default(), Registry::open(None).unwrap());
     let made = graph
         .run(&[trained.target()], device, &registry, store, &Recorded::new(&steps))

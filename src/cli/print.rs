@@ -1,5 +1,6 @@
 //! Standard output.
 use super::line::lines;
+use crate::report::shell_quoted;
 use crate::{Error, Result};
 use std::io::Write;
 use std::path::Path;
@@ -27,14 +28,7 @@ pub fn print_json(value: &serde_json::Value) -> Result<()> {
 /// Last two lines after a scene was made, to copy whole: path of its report, and the command that
 /// shows it.
 pub fn ending(scene: &Path) -> String {
-    format!("{}\nsplatvk view {}\n", quoted(&scene.join("report.html")), quoted(scene))
-}
-
-/// A path in the quotes of a shell.
-pub fn quoted(path: &Path) -> String {
-    let text = path.display().to_string();
-    let plain = |c: char| c.is_alphanumeric() || "/._-+,:@%".contains(c);
-    if text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', "'\\''")) }
+    format!("{}\nsplatvk view {}\n", shell_quoted(&scene.join("report.html")), shell_quoted(scene))
 }
 
 /// Names the files that a command wrote.
@@ -51,10 +45,7 @@ mod tests {
 
     #[test]
     fn ending_quotes_paths_for_shell() {
-        assert_eq!(
-            ending(Path::new("out/tree")),
-            "out/tree/report.html\nsplatvk view out/tree\n"
-        );
+        assert_eq!(ending(Path::new("out/tree")), "out/tree/report.html\nsplatvk view out/tree\n");
         assert_eq!(
             ending(Path::new("it's a tree")),
             "'it'\\''s a tree/report.html'\nsplatvk view 'it'\\''s a tree'\n"

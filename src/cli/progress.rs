@@ -3,13 +3,13 @@
 use super::args::LogFormat;
 use super::line::one_line;
 use crate::Error;
-use crate::progress::Progress;
+use crate::progress::{Overall, Progress};
 use crate::sync::lock;
 use indicatif::{HumanDuration, MultiProgress, ProgressBar, ProgressState, ProgressStyle};
 use serde_json::{Value, json};
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{LazyLock, Mutex, OnceLock};
+use std::sync::{Arc, LazyLock, Mutex, OnceLock};
 use std::time::{Duration, Instant};
 
 /// Set by the first Ctrl-C; work checks it between steps.
@@ -35,7 +35,7 @@ fn as_json() -> bool {
 
 /// Progress reporter of the commands.
 pub fn reporter() -> Box<dyn Progress> {
-    if as_json() { Box::new(JsonLines::default()) } else { Box::new(Terminal::default()) }
+    if as_json() { Box::new(JsonLines::default()) } else { Box::new(Terminal::new(true)) }
 }
 
 /// Whether the user requested a stop.
@@ -121,18 +121,35 @@ fn write_line(line: &str) {
 #[derive(Default)]
 struct JsonLines {
     current: Mutex<Option<(&'static str, u64, Instant)>>,
+    overall: Mutex<Option<Overall>>,
+}
+
+impl JsonLines {
+    /// Adds the place in the whole work to an event, where it is known.
+    fn placed(&self, mut fields: Value) -> Value {
+        if let Some(overall) = *lock(&self.overall) {
+            fields["stage_number"] = overall.stage.into();
+            fields["stages"] = overall.stages.into();
+            fields["seconds_left"] = json!(overall.seconds_left.map(f64::round));
+        }
+        fields
+    }
 }
 
 impl Progress for JsonLines {
     fn begin(&self, stage: &'static str, steps: u64) {
         self.end();
-        write_event("begin", json!({ "stage": stage, "steps": steps }));
+        write_event("begin", self.placed(json!({ "stage": stage, "steps": steps })));
         *lock(&self.current) = Some((stage, steps, Instant::now()));
     }
     fn step(&self, done: u64, note: &str) {
         if let Some((stage, steps, _)) = *lock(&self.current) {
-            write_event("step", json!({ "stage": stage, "done": done, "steps": steps, "note": note }));
+            let fields = json!({ "stage": stage, "done": done, "steps": steps, "note": note });
+            write_event("step", self.placed(fields));
         }
+    }
+    fn overall(&self, overall: Overall) {
+        *lock(&self.overall) = Some(overall);
     }
     fn figures(&self, step: u64, figures: &[(&str, f64)]) {
         let stage = lock(&self.current).map(|(stage, _, _)| stage);
@@ -225,17 +242,37 @@ fn print(line: &str) {
     }
 }
 
-/// Writes the remaining time; nothing before the first step.
+/// Writes the remaining time of a stage; nothing before the first step.
 fn time_left(state: &ProgressState, text: &mut dyn std::fmt::Write) {
     if state.pos() > 0 {
         let _ = write!(text, "{:#} left", HumanDuration(state.eta()));
     }
 }
 
+/// Place in the whole work in words: "stage 4 of 13, about 5 min left in all".
+fn place_text(overall: &Overall) -> String {
+    let left = match overall.seconds_left {
+        None => String::new(),
+        Some(s) if s < 45.0 => ", less than a minute left in all".to_owned(),
+        Some(s) if s < 3570.0 => format!(", about {:.0} min left in all", (s / 60.0).max(1.0)),
+        Some(s) => format!(", about {:.1} h left in all", s / 3600.0),
+    };
+    format!("stage {} of {}{left}", overall.stage, overall.stages)
+}
+
 /// [`Progress`] for people: bars if standard error is a terminal, else lines.
-#[derive(Default)]
 struct Terminal {
     current: Mutex<Option<Stage>>,
+    /// Place in the whole work, for the bar and for lines.
+    place: Arc<Mutex<String>>,
+    /// Whether it is the first lane: the time left of another would read as that of the whole.
+    first: bool,
+}
+
+impl Terminal {
+    fn new(first: bool) -> Terminal {
+        Terminal { current: Mutex::default(), place: Arc::default(), first }
+    }
 }
 
 impl Progress for Terminal {
@@ -246,7 +283,17 @@ impl Progress for Terminal {
             None => ProgressBar::hidden(),
         };
         if let Ok(style) = ProgressStyle::with_template("{msg:>15} {wide_bar} {pos}/{len} {prefix} {left}") {
-            bar.set_style(style.with_key("left", time_left));
+            let (place, first) = (self.place.clone(), self.first);
+            let left = move |state: &ProgressState, text: &mut dyn std::fmt::Write| {
+                let place = lock(&place);
+                match place.is_empty() {
+                    // Writing to a String cannot fail.
+                    false => drop(text.write_str(&place)),
+                    true if first => time_left(state, text),
+                    true => {}
+                }
+            };
+            bar.set_style(style.with_key("left", left));
         }
         bar.set_message(stage);
         bar.tick();
@@ -258,11 +305,17 @@ impl Progress for Terminal {
             bar.set_prefix(one_line(note));
         }
     }
+    fn overall(&self, overall: Overall) {
+        *lock(&self.place) = place_text(&overall);
+    }
     fn end(&self) {
         let Some((name, start, bar)) = lock(&self.current).take() else { return };
         let note = bar.prefix();
         bar.finish_and_clear();
-        let line = format!("{name:>15}  {:6.1} s  {note}", start.elapsed().as_secs_f64());
+        let place = lock(&self.place).clone();
+        let parts = [note, place];
+        let rest: Vec<&str> = parts.iter().map(String::as_str).filter(|p| !p.is_empty()).collect();
+        let line = format!("{name:>15}  {:6.1} s  {}", start.elapsed().as_secs_f64(), rest.join("; "));
         print(line.trim_end());
     }
     fn warn(&self, message: &str) {
@@ -275,6 +328,21 @@ impl Progress for Terminal {
         stopped()
     }
     fn second_lane(&self) -> Box<dyn Progress + '_> {
-        Box::new(Terminal::default())
+        Box::new(Terminal::new(false))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn place_text_rounds_to_minutes() {
+        let text = |seconds_left| place_text(&Overall { stage: 4, stages: 13, seconds_left });
+        assert_eq!(text(None), "stage 4 of 13");
+        assert_eq!(text(Some(20.0)), "stage 4 of 13, less than a minute left in all");
+        assert_eq!(text(Some(50.0)), "stage 4 of 13, about 1 min left in all");
+        assert_eq!(text(Some(290.0)), "stage 4 of 13, about 5 min left in all");
+        assert_eq!(text(Some(5400.0)), "stage 4 of 13, about 1.5 h left in all");
     }
 }

@@ -13,9 +13,11 @@ use crate::report::viewer::{self, CodeNames, SCENE_PATH, Scene3d};
 use crate::run::Compat;
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
+use crate::run::preview;
 use crate::scene::{Camera, RgbImage};
 use crate::{Error, Result};
 use serde_json::json;
+use std::path::Path;
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
@@ -23,13 +25,14 @@ use std::time::{Duration, Instant};
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
 
 pub fn view(args: &ViewArgs) -> Result<()> {
-    let scene = scene::load(&args.scene)?;
+    let (scene, is_preview) = load(&args.scene)?;
     if scene.splats.is_empty() {
         return Err(Error::input(format!("{}: no splats to show", args.scene.display())));
     }
     // The port is bound first: one that is in use is reported before the scene is prepared.
     let server = ServerAddress::bind(args.port)?;
     let (mut ready, no_questions) = match query_scene(&scene, args) {
+        _ if is_preview => (None, Some("words come with the finished scene".to_owned())),
         Ok(ready) => (Some(ready), None),
         Err(error) => (None, Some(error.to_string())),
     };
@@ -39,7 +42,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     let options = Compat::answers(None, &args.scene)?;
     let names = ready.as_mut().map_or(Ok(CodeNames::new()), QueryScene::names)?;
     let site = Site {
-        page: page(&scene, args, &names, no_questions.as_deref())?,
+        page: page(&scene, args, &names, no_questions.as_deref(), is_preview)?,
         scene_path: SCENE_PATH,
         scene: viewer::pack(&scene.splats, &scene.seen, scene.language.as_ref(), usize::MAX)?.bytes,
         answers_questions: ready.is_some(),
@@ -49,9 +52,12 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     // From here on stopping leaves nothing undone. Whoever reads the address may stop the server.
     progress::stop_without_error();
     if args.device.json {
-        print_json(&json!({ "address": address, "scene": args.scene, "questions": ready.is_some() }))?;
+        print_json(&json!({
+            "address": address, "scene": args.scene, "questions": ready.is_some(), "preview": is_preview,
+        }))?;
     } else {
-        print(&format!("{} is at {address}  (Ctrl-C ends)\n", args.scene.display()))?;
+        let what = if is_preview { "a preview of " } else { "" };
+        print(&format!("{what}{} is at {address}  (Ctrl-C ends)\n", args.scene.display()))?;
     }
     let input = StandardInput::new();
     while !progress::stopped() && !input.has_closed() {
@@ -70,6 +76,15 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     Ok(())
 }
 
+/// Loads the preview of a scene that a run is making, or the scene; and whether it is a preview.
+fn load(path: &Path) -> Result<(Scene, bool)> {
+    // The run may end at this moment and take its preview away.
+    match preview::of_running(path).map(|preview| scene::load(&preview)) {
+        Some(Ok(scene)) => Ok((scene, true)),
+        _ => Ok((scene::load(path)?, false)),
+    }
+}
+
 /// Prepares the scene for questions in its own views.
 fn query_scene(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
     let field = scene.language.clone().ok_or_else(|| Error::input("this scene has no language"))?;
@@ -80,7 +95,13 @@ fn query_scene(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
     Ok(ready)
 }
 
-fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<&str>) -> Result<String> {
+fn page(
+    scene: &Scene,
+    args: &ViewArgs,
+    names: &CodeNames,
+    no_questions: Option<&str>,
+    is_preview: bool,
+) -> Result<String> {
     // Photos are optional: a scene without its images, or with images elsewhere, is still shown.
     let load = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
     let photos: Option<Vec<_>> = scene.cameras.iter().map(load).collect();
@@ -98,7 +119,8 @@ fn page(scene: &Scene, args: &ViewArgs, names: &CodeNames, no_questions: Option<
         names,
         answers: Vec::new(),
     };
-    view.served(no_questions)
+    let notice = "A preview: the scene is still being made. Open it again when the run is done.";
+    view.served(no_questions, is_preview.then_some(notice))
 }
 
 fn reply(ready: Option<&mut QueryScene>, text: &str, options: &QueryOptions) -> Answer {

@@ -46,9 +46,8 @@ fn curve(curve: &Curve) -> String {
 
 fn tables(report: &HtmlReport) -> String {
     let run = report.run;
-    let mut times = String::from(
-        "<table class=\"time\"><tr><th>stage<th>time; bars show when<th>peak memory</tr>",
-    );
+    let mut times =
+        String::from("<table class=\"time\"><tr><th>stage<th>time; bars show when<th>peak memory</tr>");
     let percent = |seconds: f64| seconds / run.seconds.max(1e-9) * 100.0;
     for s in &run.stages {
         let memory =

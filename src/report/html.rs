@@ -1,8 +1,6 @@
 //! `report.html`, one self-contained file, readable on a phone.
 use super::chart::escape;
-use super::{
-    AnswerShown, Certainty, HtmlReport, Picture, QueryShown, ViewShown, figures, one_line, viewer,
-};
+use super::{AnswerShown, Certainty, HtmlReport, Picture, QueryShown, ViewShown, figures, one_line, viewer};
 use crate::format::picture;
 use crate::scene::RgbImage;
 use crate::{Error, Result};
@@ -256,9 +254,12 @@ mod tests {
         }
         // Words, photos, figures; what does not matter is folded.
         let at = |text: &str| html.find(text).unwrap_or_else(|| panic!("{text}"));
-        let order = ["<h2>Words", "thousand everyday", "<h2>Photos", "<h2>Figures", "<dt>cameras", "<dt>splats"];
+        let order =
+            ["<h2>Words", "thousand everyday", "<h2>Photos", "<h2>Figures", "<dt>cameras", "<dt>splats"];
         assert!(order.windows(2).all(|pair| at(pair[0]) < at(pair[1])));
-        assert!(at("<summary>More figures") < at("<dt>splats") && at("<dt>cameras") < at("<summary>More figures"));
+        assert!(
+            at("<summary>More figures") < at("<dt>splats") && at("<dt>cameras") < at("<summary>More figures")
+        );
         assert_eq!(html.matches("<svg").count(), 1, "a single point is no curve");
         for name in ["a_render.jpg", "a_depth.jpg", "a_level_l.jpg", "query__script__a.jpg"] {
             assert!(image::open(folder.path().join("previews").join(name)).is_ok(), "{name}");

@@ -1,4 +1,5 @@
 //! Sanitised text of files and users for a line of a message, a table or a page.
+use std::path::Path;
 
 /// Most characters of an error, warning or message. Longer ones keep their beginning and their end,
 /// where the advice is.
@@ -22,6 +23,13 @@ pub fn one_line(message: &str) -> String {
     }
     let byte = |n: usize| line.char_indices().nth(n).map_or(line.len(), |(byte, _)| byte);
     format!("{}…{}", &line[..byte(LONGEST - END - 1)], &line[byte(count - END)..])
+}
+
+/// A path in the quotes of a shell, where it needs them.
+pub fn shell_quoted(path: &Path) -> String {
+    let text = path.display().to_string();
+    let plain = |c: char| c.is_alphanumeric() || "/._-+,:@%".contains(c);
+    if text.chars().all(plain) { text } else { format!("'{}'", text.replace('\'', "'\\''")) }
 }
 
 /// Returns the character, or U+FFFD for control characters, which terminals execute, and

@@ -13,7 +13,7 @@ pub use contents::{
     AnswerShown, Certainty, Curve, Figure, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown,
 };
 pub use html::write_html;
-pub use line::{one_line, visible};
+pub use line::{one_line, shell_quoted, visible};
 pub use summary::{duration, table};
 
 pub use crate::progress::StageRecord;

@@ -410,7 +410,10 @@ mod tests {
                 Reading { phrasing: Some(cut), vocabulary: None },
                 "answers for “lemon”; “on the plate” is not understood",
             ),
-            (Reading { phrasing: None, vocabulary: Some(unknown) }, "outside the vocabulary; nearest: “orange”"),
+            (
+                Reading { phrasing: None, vocabulary: Some(unknown) },
+                "outside the vocabulary; nearest: “orange”",
+            ),
         ] {
             let a = wall.ask("lemon", reading);
             assert_eq!((a.presence, a.found()), (Some(Presence::Unsure), 1));

@@ -5,6 +5,8 @@ use super::graph::{self, ScenePlan};
 use super::networks::Networks;
 use super::outcome::{LanguageOutcome, RunOutcome};
 use super::plan::{Extras, Inputs, RunPlan};
+use super::preview::Preview;
+use super::remaining::{WithRemaining, Work};
 use super::sources::{self, GraphBuilder};
 use super::stages::{CameraOrigin, PlacedPhotos};
 use super::view::Viewer;
@@ -24,7 +26,8 @@ use std::time::Duration;
 
 /// Runs the plan and writes the scene directory, whole or not at all.
 pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
-    let progress = &Recorded::new(progress);
+    let remaining = WithRemaining::new(progress);
+    let progress = &Recorded::new(&remaining);
     plan.inputs.check()?;
     let base = plan.inputs.add.as_deref().map(BaseScene::open).transpose()?.map(Arc::new);
     let registry = plan.machine.registry()?;
@@ -61,7 +64,14 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     };
     let store = store(plan.output.resume, plan.output.checkpoint_seconds)?;
     let queries = &plan.inputs.queries;
-    let reconstruction = Reconstruction { config: &plan.config, queries, base: base.as_ref(), origin };
+    let reconstruction = Reconstruction {
+        config: &plan.config,
+        queries,
+        base: base.as_ref(),
+        origin,
+        remaining: &remaining,
+        preview: Some(Preview::of(&workspace, &plan.output.out)),
+    };
     let made = reconstruction.run(&device, &registry, photos, &store, progress)?;
     let outcome = RunOutcome { choice, plan: plan.clone(), ..made };
     write(workspace, &outcome, progress)?;
@@ -78,13 +88,21 @@ pub fn reconstruct(
     progress: &dyn Progress,
 ) -> Result<RunOutcome> {
     photo::check_set(&photos)?;
-    let progress = &Recorded::new(progress);
+    let remaining = WithRemaining::new(progress);
+    let progress = &Recorded::new(&remaining);
     photo::cut_bars(&mut photos, progress);
     let sizes: Vec<_> = photos.iter().map(|p| (p.image.width, p.image.height)).collect();
     config.check_budget(device, &sizes, usize::MAX)?;
     let paths = photos.iter().map(|p| p.path.clone()).collect();
     let given = (!extras.cameras.is_empty()).then(|| CameraOrigin::Known(extras.cameras.clone().into()));
-    let reconstruction = Reconstruction { config, queries: &extras.queries, base: None, origin: given };
+    let reconstruction = Reconstruction {
+        config,
+        queries: &extras.queries,
+        base: None,
+        origin: given,
+        remaining: &remaining,
+        preview: None,
+    };
     let made = reconstruction.run(device, registry, photos, &Store::none(), progress)?;
     let inputs = Inputs { photos: paths, queries: extras.queries.clone(), ..Inputs::default() };
     Ok(RunOutcome { plan: RunPlan { inputs, config: config.clone(), ..RunPlan::default() }, ..made })
@@ -105,6 +123,8 @@ struct Reconstruction<'a> {
     base: Option<&'a Arc<BaseScene>>,
     /// Given cameras or geometry, instead of the source of the configuration.
     origin: Option<CameraOrigin>,
+    remaining: &'a WithRemaining<'a>,
+    preview: Option<Preview>,
 }
 
 impl Reconstruction<'_> {
@@ -116,7 +136,7 @@ impl Reconstruction<'_> {
         store: &Store,
         progress: &Recorded,
     ) -> Result<RunOutcome> {
-        let Reconstruction { config, queries, base, origin } = self;
+        let Reconstruction { config, queries, base, origin, remaining, preview } = self;
         // Everything that can be refused is read before the long stages.
         config.check()?;
         // Given cameras and points need no network.
@@ -131,8 +151,18 @@ impl Reconstruction<'_> {
             graph::check(config, &photos, registry)?;
         }
         let preset = config.preset_on(device);
-        let mut plan =
-            ScenePlan { build: GraphBuilder::new(config, preset, registry), config, queries, device };
+        let training = config.rgb_options(preset, device, photos.len());
+        remaining.plan(&Work {
+            on_cpu: device.info().is_cpu,
+            photos: photos.len(),
+            pixels: photos.iter().map(|p| p.image.width * p.image.height).sum(),
+            steps: training.iterations,
+            half_res: training.half_res,
+            language: config.language.is_some(),
+            built_in: networks.is_empty(),
+        });
+        let build = GraphBuilder::new(config, preset, registry);
+        let mut plan = ScenePlan { build, config, queries, device, preview };
         let scene = match base {
             Some(base) => plan.added(base, photos)?,
             None => plan.scene(photos, origin)?,

@@ -3,6 +3,7 @@ use super::answer::Answers;
 use super::base::BaseScene;
 use super::compat::query_options;
 use super::config::{LanguageConfig, ReconstructionConfig};
+use super::preview::Preview;
 use super::sources::{
     self, DepthSources, FeatureSources, GeometrySources, Given, GraphBuilder, MaskSources, MatchSources,
     PosedPhotos,
@@ -28,6 +29,7 @@ pub(super) struct ScenePlan<'a> {
     pub(super) config: &'a ReconstructionConfig,
     pub(super) queries: &'a [String],
     pub(super) device: &'a Device,
+    pub(super) preview: Option<Preview>,
 }
 
 /// Outputs of the stages of a run.
@@ -101,7 +103,8 @@ impl ScenePlan<'_> {
             }
         };
         let PosedPhotos { placed, geometry } = posed;
-        let trained = self.build.graph.add(stages::TrainColour { options }, (placed, geometry));
+        let train = stages::TrainColour { options, preview: self.preview.take() };
+        let trained = self.build.graph.add(train, (placed, geometry));
         let trained = self.view_dependence(placed, trained);
         let up = self.build.graph.add(stages::Upright, (placed, geometry, trained));
         let language = match (&self.config.language, encoder) {

@@ -34,7 +34,11 @@ pub(super) fn figure(photos: &[Photo]) -> Option<Figure> {
         bright - dark,
         colour_percent(0).max(colour_percent(1)),
     );
-    Some(Figure::new("light", text, "Differences of exposure, white balance and vignetting among the photos."))
+    Some(Figure::new(
+        "light",
+        text,
+        "Differences of exposure, white balance and vignetting among the photos.",
+    ))
 }
 
 /// Minimum and maximum of a figure over the photos.

@@ -26,6 +26,11 @@ impl Networks {
         Ok(Networks(found.into_iter().flatten().collect()))
     }
 
+    /// Whether built-in methods do all of the work.
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
     /// Entries of run.json.
     pub(super) fn used(&self) -> Result<Vec<ModelUsed>> {
         let mut used = Vec::new();

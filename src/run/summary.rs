@@ -117,7 +117,8 @@ fn figures(o: &RunOutcome) -> Vec<Figure> {
     if let Some(language) = &o.language {
         let codes = |k: usize| language.field.levels.get(k).map_or(0, |l| l.codebook.len());
         let text = format!("{}, of {} parts and {} subparts", codes(2), codes(1), codes(0));
-        let meaning = "What the scene is divided into. A click selects one; a thing may still be several that touch.";
+        let meaning =
+            "What the scene is divided into. A click selects one; a thing may still be several that touch.";
         list.push(Figure::that_matters("things", text, meaning));
     }
     list.push(up_figure(&o.world));
@@ -272,12 +273,7 @@ fn shown(a: &Answers) -> QueryShown<'_> {
         .views
         .iter()
         .enumerate()
-        .map(|(view, v)| AnswerShown {
-            view,
-            relevancy: &v.relevancy,
-            mask: Some(&v.mask),
-            found: v.found,
-        })
+        .map(|(view, v)| AnswerShown { view, relevancy: &v.relevancy, mask: Some(&v.mask), found: v.found })
         .collect();
     let certainty = match a.presence {
         _ if a.found() == 0 => Certainty::Nothing,

@@ -6,6 +6,17 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+/// Place of a stage in the whole work, with an estimate of the rest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Overall {
+    /// Number of the current stage, from 1.
+    pub stage: usize,
+    /// Number of stages; a run may skip some.
+    pub stages: usize,
+    /// Estimated seconds until the work is done; `None` where nothing is known.
+    pub seconds_left: Option<f64>,
+}
+
 /// Receives progress from any thread. The command line draws bars, hosts may forward it, tests use
 /// [`Silent`].
 pub trait Progress: Send + Sync {
@@ -16,6 +27,9 @@ pub trait Progress: Send + Sync {
     fn step(&self, done: u64, note: &str);
     /// Measurements of the current stage at a step, by name: loss, PSNR in dB, counts.
     fn figures(&self, _step: u64, _figures: &[(&str, f64)]) {}
+    /// Place in the whole work; precedes every `begin`, `step` and `end` of the first lane where it
+    /// is known.
+    fn overall(&self, _overall: Overall) {}
     /// The current stage is over.
     fn end(&self);
     /// A warning for the user, one line.

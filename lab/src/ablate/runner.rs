@@ -211,7 +211,7 @@ impl<'a> Runner<'a> {
         let PosedPhotos { placed, geometry } = posed;
         let matches = sources::make::<MatchSources>(&setup.matcher, registry, (&mut build, posed))?;
         let options = self.rgb_options(setup);
-        let trained = build.graph.add(stages::TrainColour { options }, (placed, geometry));
+        let trained = build.graph.add(stages::TrainColour { options, preview: None }, (placed, geometry));
         let RegionData { masks, embeddings, queries, space } = self.add_regions(setup, &mut build, posed)?;
         let (recipe, seed) = (setup.recipe, self.seed);
         let aligned = build.graph.add(stages::Align { recipe, space, seed }, (masks, matches, geometry));

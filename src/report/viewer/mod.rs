@@ -121,11 +121,12 @@ impl Scene3d<'_> {
     }
 
     /// Whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `no_questions` is
-    /// the reason why it cannot answer, if any.
-    pub fn served(&self, no_questions: Option<&str>) -> Result<String> {
+    /// the reason why it cannot answer, if any, and `notice` a line that the page shows at first.
+    pub fn served(&self, no_questions: Option<&str>, notice: Option<&str>) -> Result<String> {
         let mut manifest = self.manifest(no_questions.unwrap_or_default())?;
         manifest["live"] = no_questions.is_none().into();
         manifest["scene"] = SCENE_PATH.into();
+        manifest["notice"] = notice.into();
         let title = super::chart::escape(self.title);
         Ok(format!(
             "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" \
@@ -236,10 +237,11 @@ mod tests {
         let forward = camera.pose.rotation.row(2);
         assert_eq!(manifest["views"][0]["rotation"][8], forward.z);
         assert_eq!(manifest["views"][0]["rotation"][6], forward.x);
-        let page = scene.served(Some("no model")).unwrap();
+        let page = scene.served(Some("no model"), Some("a preview")).unwrap();
         assert!(page.contains("viewer full") && page.contains("a&lt;b") && !page.contains("v-splats\""));
         assert!(page.contains("\"ask_note\":\"no model\"") && page.contains("\"live\":false"));
-        assert!(scene.served(None).unwrap().contains("\"live\":true"));
+        assert!(page.contains("\"notice\":\"a preview\""));
+        assert!(scene.served(None, None).unwrap().contains("\"live\":true"));
         // Every imported module exists.
         for (_, text) in MODULES {
             for line in text.lines().filter(|l| l.starts_with("import ")) {

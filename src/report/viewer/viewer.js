@@ -359,12 +359,12 @@ function listQueries() {
 }
 
 let saying;
-function say(text) {
+function say(text, stays = false) {
   const box = find(".v-status");
   clearTimeout(saying);
   box.textContent = text;
   box.hidden = !text;
-  if (text) saying = setTimeout(() => { box.hidden = true; }, 6000);
+  if (text && !stays) saying = setTimeout(() => { box.hidden = true; }, 6000);
 }
 
 // --- controls -----------------------------------------------------------------------------------
@@ -453,6 +453,7 @@ const actions = {
 
 let input;
 function connect() {
+  say(manifest.notice ?? "", true);
   find(".v-modes").replaceChildren(...modes.map((m) => button(m.name, () => show(m.mode, m.level), { role: "radio", title: m.title ?? "" })));
   show("colour");
   find(".v-photos").replaceChildren(...views.map((v, i) => {

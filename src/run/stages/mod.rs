@@ -12,7 +12,7 @@ mod splats;
 
 pub use added::{AddedCameras, AddedDepth, AlignAdded, KnownUp, OnlyAdded, OnlyAddedGeometry, TrainOn};
 pub use answers::{AnswerQueries, DecodeViews};
-pub use cameras::{CameraOrigin, Cameras, DenseDepth, PlacedPhotos, Upright};
+pub use cameras::{CameraOrigin, Cameras, DenseDepth, KnownGeometry, PlacedPhotos, Upright};
 pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage};
 pub use masks::{ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures};
 pub use matches::{DescriptorMatches, Descriptors, NetworkMatches};

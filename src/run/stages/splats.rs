@@ -5,11 +5,14 @@ use crate::Result;
 use crate::fit::{self, RgbOptions, Trained, ViewDependentOptions};
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::Geometry;
+use crate::run::preview::Preview;
 
 /// The colour stage.
 pub struct TrainColour {
     /// Options of the training.
     pub options: RgbOptions,
+    /// Where to show a preview while it runs.
+    pub preview: Option<Preview>,
 }
 
 impl Stage for TrainColour {
@@ -30,7 +33,12 @@ impl Stage for TrainColour {
         let depths = (!geometry.depths.is_empty()).then_some(geometry.depths.as_slice());
         let (targets, coverage) = shared::targets(&placed.photos);
         let photos = shared::posed(&targets, &geometry.cameras, depths, &coverage);
-        fit::train_photos(context.device, photos, &geometry.points, &self.options, context.progress)
+        std::thread::scope(|scope| {
+            if let Some(preview) = &self.preview {
+                scope.spawn(|| preview.show(placed, geometry, &self.options, context.progress));
+            }
+            fit::train_photos(context.device, photos, &geometry.points, &self.options, context.progress)
+        })
     }
 }
 

@@ -57,6 +57,11 @@ impl Workspace {
         self.partial.path()
     }
 
+    /// Place for a preview of the folder, which goes when the folder is moved or removed.
+    pub fn preview(&self) -> PathBuf {
+        self.partial.preview()
+    }
+
     /// Moves the folder to its place; a scene that `force` permits to replace is removed only after
     /// that. Where an entry that may not be replaced came there meanwhile, the folder is moved
     /// beside it, and the error names that place.

@@ -15,6 +15,8 @@ pub(super) const NEW: &str = "new";
 /// Folder that holds the replaced result meanwhile, on file systems that cannot exchange two
 /// folders.
 const OLD: &str = "old";
+/// Folder that holds a preview of the output.
+pub(super) const PREVIEW: &str = "preview";
 /// Most bytes of a mark: ten times a long one.
 const LONGEST_MARK: u64 = 1 << 14;
 /// Number and interval of attempts: another process holds the lock of a dead owner only while it
@@ -301,6 +303,11 @@ impl Held {
     /// Place of the replaced result between two moves, where the system needs two.
     pub fn aside(&self) -> PathBuf {
         self.folder.join(OLD)
+    }
+
+    /// Place of a preview of the output.
+    pub fn preview(&self) -> PathBuf {
+        self.folder.join(PREVIEW)
     }
 
     /// Restores a result that a killed process had moved aside; returns whether none is left here.

@@ -1,7 +1,7 @@
 //! Unfinished output in a hidden folder that its owner has marked and locked. It is removed when
 //! the work fails or the process is stopped; after a kill, by the next process that writes to the
 //! place.
-use super::owner::{self, Found, Held, NEW};
+use super::owner::{self, Found, Held, NEW, PREVIEW};
 use crate::sync::lock;
 use crate::{Error, Result};
 use std::ffi::OsString;
@@ -76,6 +76,18 @@ impl Partial {
     /// Path for the replaced output between two moves.
     pub fn aside(&self) -> PathBuf {
         self.held.as_ref().map(Held::aside).unwrap_or_default()
+    }
+
+    /// Place for a preview of the output, beside it in the hidden folder, with which it goes.
+    pub fn preview(&self) -> PathBuf {
+        self.held.as_ref().map(Held::preview).unwrap_or_default()
+    }
+
+    /// Preview of the output that a living process writes to `place`, where there is one.
+    pub fn preview_of_running(place: &Path) -> Option<PathBuf> {
+        let hidden = hidden_beside(place);
+        let preview = hidden.join(PREVIEW);
+        (preview.is_dir() && !is_leftover(&hidden)).then_some(preview)
     }
 
     /// Moves the output to its place by `rename`, then removes the rest at [`Partial::path`] and

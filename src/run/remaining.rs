@@ -1,0 +1,334 @@
+//! Estimate of the time that a run still takes: typical seconds of its stages, scaled by the pace
+//! that this run has shown so far.
+use crate::progress::{Overall, Progress};
+use crate::sync::lock;
+use std::sync::Mutex;
+use std::time::Instant;
+
+/// Working pixels of one of the photos that the typical seconds are of.
+const TYPICAL_PIXELS: f64 = 640.0 * 480.0;
+/// Number of these photos.
+const TYPICAL_PHOTOS: f64 = 4.0;
+/// Training steps that the typical seconds are of.
+const TYPICAL_STEPS: f64 = 400.0;
+/// Typical seconds that the pace of the machine is at first assumed for. They keep the noise of the
+/// first short stages out of the estimate.
+const PRIOR: f64 = 5.0;
+/// Share of a stage from which only its own pace decides what is left of it.
+const OWN_PACE: f64 = 0.25;
+/// Share of the time of dense stereo that its first tenth takes beyond its part: coarse levels wait
+/// for the device, and the processor finds edges beside.
+const STEREO_START: f64 = 0.2;
+/// Cost of a training step at full resolution, in steps at half of it.
+const FULL_RES: f64 = 1.45;
+
+/// A stage of the first lane, for which all later ones wait.
+struct Part {
+    stage: &'static str,
+    /// Typical seconds.
+    seconds: f64,
+}
+
+/// Size of the work.
+pub(super) struct Work {
+    /// Whether the device computes on the CPU.
+    pub(super) on_cpu: bool,
+    /// Number of photos.
+    pub(super) photos: usize,
+    /// Working pixels of all photos.
+    pub(super) pixels: usize,
+    /// Training steps.
+    pub(super) steps: usize,
+    /// Share of the training steps at half resolution.
+    pub(super) half_res: f64,
+    /// Whether the scene gets language.
+    pub(super) language: bool,
+    /// Whether built-in methods do all of the work. The time of networks is not known before.
+    pub(super) built_in: bool,
+}
+
+/// Stages of a run with their typical seconds: of breakfast on two processor cores (llvmpipe), and
+/// on an H200 with 16 (docs/internals/performance.md).
+fn parts(work: &Work) -> Vec<Part> {
+    let photos = work.photos as f64 / TYPICAL_PHOTOS;
+    let pixels = work.pixels as f64 / (TYPICAL_PHOTOS * TYPICAL_PIXELS);
+    let steps = work.steps as f64 / TYPICAL_STEPS * pixels / photos.max(1e-9);
+    let view_dependence = if work.photos < 4 { 0.0 } else { 1.0 };
+    let list = [
+        ("photos", 0.1, 0.1, photos),
+        ("features", 0.3, 0.1, photos),
+        // Pairs of photos.
+        ("cameras", 6.0, 2.5, photos * photos),
+        ("dense stereo", 60.0, 0.3, pixels),
+        ("surfaces", 3.0, 1.1, pixels),
+        ("initial splats", 1.5, 0.4, pixels),
+        ("splats", 110.0, 0.8, steps),
+        // Half of the time on photos of shiny things; matt ones skip it.
+        ("view dependence", 6.0, 0.2, pixels * view_dependence),
+        ("language", 8.0, 0.4, pixels),
+        ("decode", 5.0, 0.3, pixels),
+        ("query", 0.5, 0.2, 1.0),
+        ("seen", 1.0, 0.1, pixels),
+        ("write", 1.5, 0.3, pixels),
+    ];
+    let of_language = |stage: &str| ["language", "decode", "query"].contains(&stage);
+    list.into_iter()
+        .filter(|(stage, ..)| work.language || !of_language(stage))
+        .map(|(stage, cpu, gpu, scale)| Part { stage, seconds: scale * if work.on_cpu { cpu } else { gpu } })
+        .collect()
+}
+
+/// Course of a run.
+#[derive(Default)]
+struct Course {
+    parts: Vec<Part>,
+    half_res: f64,
+    built_in: bool,
+    /// Index of the current or last stage.
+    at: usize,
+    /// Start of the current stage; `None` between two.
+    began: Option<f64>,
+    /// Finished share of the current stage, of its time.
+    share: f64,
+    /// Typical and true seconds of the finished stages.
+    finished: [f64; 2],
+}
+
+impl Course {
+    /// A stage of the first lane begins at `now`, seconds.
+    fn begin(&mut self, stage: &str, now: f64) {
+        self.end(now);
+        // Others are parts of the last one or come before all.
+        if let Some(at) = self.parts.iter().position(|p| p.stage == stage) {
+            (self.at, self.began, self.share) = (at, Some(now), 0.0);
+        }
+    }
+
+    fn step(&mut self, done: u64, steps: u64) {
+        let share = (done as f64 / steps.max(1) as f64).min(1.0);
+        let stage = self.parts.get(self.at).map(|p| p.stage);
+        self.share = self.time_share(stage.unwrap_or_default(), share);
+    }
+
+    /// Share of the time of a stage that this share of its steps takes.
+    fn time_share(&self, stage: &str, steps: f64) -> f64 {
+        match stage {
+            "splats" => {
+                let cost = |x: f64| x.min(self.half_res) + FULL_RES * (x - self.half_res).max(0.0);
+                cost(steps) / cost(1.0)
+            }
+            "dense stereo" => STEREO_START * (10.0 * steps).min(1.0) + (1.0 - STEREO_START) * steps,
+            _ => steps,
+        }
+    }
+
+    fn end(&mut self, now: f64) {
+        if let (Some(began), Some(part)) = (self.began.take(), self.parts.get(self.at)) {
+            self.finished[0] += part.seconds;
+            self.finished[1] += now - began;
+            self.share = 1.0;
+        }
+    }
+
+    /// Place in the run and an estimate of the seconds left at `now`.
+    fn overall(&self, now: f64) -> Option<Overall> {
+        let current = self.parts.get(self.at)?;
+        let elapsed = self.began.map_or(0.0, |began| now - began);
+        // Cameras are the first stage that says something of the machine.
+        let known = self.built_in && self.parts.iter().position(|p| p.stage == "cameras") <= Some(self.at);
+        let running = if self.began.is_some() { self.share } else { 0.0 };
+        let typical = self.finished[0] + running * current.seconds;
+        let true_seconds = self.finished[1] + if running > 0.0 { elapsed } else { 0.0 };
+        let pace = (PRIOR + true_seconds) / (PRIOR + typical);
+        let trust = (self.share / OWN_PACE).min(1.0);
+        let own = elapsed * (1.0 - self.share) / self.share.max(1e-9);
+        // A stage that overruns is nearly done.
+        let usual = (pace * current.seconds - elapsed).max(0.0) * (1.0 - trust);
+        let rest = if self.share > 0.0 { trust * own + usual } else { usual };
+        let later: f64 = self.parts[self.at + 1..].iter().map(|p| p.seconds).sum();
+        Some(Overall {
+            stage: self.at + 1,
+            stages: self.parts.len(),
+            seconds_left: known.then_some(rest + pace * later),
+        })
+    }
+}
+
+/// Progress that tells where in a run the stages of the first lane are, and how long it still
+/// takes.
+pub(super) struct WithRemaining<'a> {
+    inner: &'a dyn Progress,
+    began: Instant,
+    course: Mutex<(Course, u64)>,
+}
+
+impl<'a> WithRemaining<'a> {
+    pub(super) fn new(inner: &'a dyn Progress) -> Self {
+        WithRemaining { inner, began: Instant::now(), course: Mutex::default() }
+    }
+
+    /// The size of the work is known from here on.
+    pub(super) fn plan(&self, work: &Work) {
+        let course = &mut lock(&self.course).0;
+        (course.parts, course.half_res, course.built_in) = (parts(work), work.half_res, work.built_in);
+    }
+
+    fn tell(&self, change: impl FnOnce(&mut (Course, u64), f64)) {
+        let now = self.began.elapsed().as_secs_f64();
+        let mut course = lock(&self.course);
+        change(&mut course, now);
+        let overall = course.0.overall(now);
+        drop(course);
+        if let Some(overall) = overall {
+            self.inner.overall(overall);
+        }
+    }
+}
+
+impl Progress for WithRemaining<'_> {
+    fn begin(&self, stage: &'static str, steps: u64) {
+        self.tell(|(course, length), now| {
+            course.begin(stage, now);
+            *length = steps;
+        });
+        self.inner.begin(stage, steps);
+    }
+    fn step(&self, done: u64, note: &str) {
+        self.tell(|(course, length), _| course.step(done, *length));
+        self.inner.step(done, note);
+    }
+    fn figures(&self, step: u64, figures: &[(&str, f64)]) {
+        self.inner.figures(step, figures);
+    }
+    fn end(&self) {
+        self.tell(|(course, _), now| course.end(now));
+        self.inner.end();
+    }
+    fn warn(&self, message: &str) {
+        self.inner.warn(message);
+    }
+    fn inform(&self, message: &str) {
+        self.inner.inform(message);
+    }
+    fn cancelled(&self) -> bool {
+        self.inner.cancelled()
+    }
+    fn second_lane(&self) -> Box<dyn Progress + '_> {
+        self.inner.second_lane()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn work() -> Work {
+        Work {
+            on_cpu: true,
+            photos: 4,
+            pixels: 4 * 640 * 480,
+            steps: 400,
+            half_res: 0.6,
+            language: true,
+            built_in: true,
+        }
+    }
+
+    fn course(work: &Work) -> Course {
+        Course { parts: parts(work), half_res: work.half_res, built_in: work.built_in, ..Course::default() }
+    }
+
+    /// A stage: begin, seconds, and finished (share of the steps, seconds).
+    type Measured = (&'static str, f64, f64, &'static [(f64, f64)]);
+
+    /// Stages of the first lane of two runs of breakfast, on a busy machine and on one that was
+    /// busy only while it trained.
+    const RUNS: [(f64, [Measured; 10]); 2] = [
+        (
+            369.0,
+            [
+                ("photos", 0.1, 0.1, &[]),
+                ("cameras", 0.8, 10.4, &[]),
+                (
+                    "dense stereo",
+                    11.4,
+                    100.7,
+                    &[(0.02, 13.7), (0.12, 26.6), (0.33, 44.7), (0.52, 60.7), (0.998, 100.7)],
+                ),
+                ("surfaces", 112.2, 4.0, &[]),
+                ("initial splats", 116.1, 2.0, &[]),
+                (
+                    "splats",
+                    118.2,
+                    221.0,
+                    &[(0.05, 11.6), (0.25, 48.2), (0.5, 94.1), (0.65, 125.6), (0.75, 152.5), (0.9, 192.6)],
+                ),
+                ("language", 339.2, 16.4, &[]),
+                ("decode", 355.6, 9.5, &[]),
+                ("seen", 365.7, 1.6, &[]),
+                ("write", 367.3, 1.7, &[]),
+            ],
+        ),
+        (
+            264.7,
+            [
+                ("photos", 0.1, 0.1, &[]),
+                ("cameras", 1.0, 10.0, &[]),
+                (
+                    "dense stereo",
+                    11.2,
+                    52.8,
+                    &[(0.02, 8.5), (0.12, 15.9), (0.33, 24.7), (0.52, 32.7), (0.998, 52.8)],
+                ),
+                ("surfaces", 64.1, 2.1, &[]),
+                ("initial splats", 66.3, 1.1, &[]),
+                ("splats", 67.3, 182.0, &[(0.25, 27.5), (0.365, 46.3), (0.495, 73.5), (0.8, 140.1)]),
+                ("language", 248.0, 8.7, &[]),
+                ("decode", 256.7, 4.8, &[]),
+                ("seen", 262.7, 0.9, &[]),
+                ("write", 263.8, 0.9, &[]),
+            ],
+        ),
+    ];
+
+    #[test]
+    fn estimate_follows_measured_runs() {
+        for (total, stages) in RUNS {
+            let mut course = course(&work());
+            let mut checked = 0;
+            for (stage, from, seconds, shares) in stages {
+                course.begin(stage, from);
+                assert_eq!(course.overall(from).unwrap().stages, 13);
+                for (steps, after) in shares {
+                    course.step((1000.0 * steps) as u64, 1000);
+                    let now = from + after;
+                    let (left, truth) = (course.overall(now).unwrap().seconds_left.unwrap(), total - now);
+                    println!("{stage} {steps} at {now:.0} s: {left:.0} s left, in truth {truth:.0}");
+                    // After the first half minute, and where the machine keeps its pace.
+                    if now > 30.0 {
+                        assert!((left - truth).abs() < 0.35 * truth + 15.0, "{left:.0}, {truth:.0}");
+                        checked += 1;
+                    }
+                }
+                course.end(from + seconds);
+            }
+            assert!(checked > 5);
+            assert!(course.overall(total).unwrap().seconds_left.unwrap() < 1.0, "all is done");
+        }
+    }
+
+    #[test]
+    fn networks_and_first_stages_have_no_estimate() {
+        let mut known = course(&work());
+        known.begin("photos", 0.0);
+        assert_eq!(known.overall(0.0), Some(Overall { stage: 1, stages: 13, seconds_left: None }));
+        known.begin("pointmaps", 1.0);
+        assert_eq!(known.overall(1.0).unwrap().stage, 1, "not one of the list");
+        known.begin("cameras", 2.0);
+        assert!(known.overall(2.0).unwrap().seconds_left.is_some());
+        let mut networks = course(&Work { built_in: false, language: false, ..work() });
+        networks.begin("splats", 5.0);
+        assert_eq!(networks.overall(5.0), Some(Overall { stage: 7, stages: 10, seconds_left: None }));
+        assert_eq!(Course::default().overall(0.0), None, "before the plan");
+    }
+}
