@@ -487,14 +487,11 @@ fn run_scene_renders_exports_and_answers() {
     npy::write(guessed.path().join("seen.npy"), &NpyArray::f32(&[all.pixels.len()], all.pixels.clone()))
         .unwrap();
     let mut seen = splatvk();
-    seen.arg("export").arg(guessed.path()).args(["--format", "ply", "--only-seen", "--force", "--out"]);
+    seen.arg("export").arg(guessed.path()).args(["--format", "ply", "--force", "--out"]);
     assert!(seen.arg(folder.path().join("a.ply")).output().unwrap().status.success());
     let kept = splatvk::format::ply::read_splats(&folder.path().join("a.ply")).unwrap();
     assert!((100..all.pixels.len() / 2).contains(&all.unseen()), "{}", all.unseen());
     assert_eq!(kept.len(), all.pixels.len() - all.unseen());
-    let mut bare = splatvk();
-    bare.arg("export").arg(folder.path().join("a.ply")).args(["--format", "splat", "--only-seen", "--out"]);
-    refuses(bare.arg(folder.path().join("b.splat")), 2, &["not known", "--only-seen"]);
     assert_eq!(names(folder.path()), ["a.ply", "a.splat", "model", "renders", "t.json"]);
     let mut nothing = splatvk();
     nothing

@@ -187,7 +187,7 @@ fn spz_limits_refuse_unsuitable_scenes() {
     let mut far = splats(3);
     far.means[1][2] = 2e7;
     gaussians::write(path_of("a.ply").as_ref(), &far, None).unwrap();
-    let words = ["b.spz: the scene reaches 2.0e7", "--only-seen", "--format ply"];
+    let words = ["b.spz: the scene reaches 2.0e7", "--format ply"];
     let line = ["export", &path_of("a.ply"), "--format", "spz", "--out", &path_of("b.spz")];
     refuses(2, &line, &words);
     let stderr = splatvk(&line).stderr;

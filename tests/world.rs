@@ -4,6 +4,7 @@
 mod fixture;
 
 use fixture::command::{refuses, splatvk, text};
+use splatvk::format::ply::PlyOptions;
 use splatvk::format::scene_dir::{self, Contents};
 use splatvk::scene::{
     Camera, Codebook, LanguageField, LevelField, PointCloud, Pose, Seen, Splats, Up, World,
@@ -70,7 +71,7 @@ fn export_up_turns_scene() {
     let (scene, splats, camera) = tilted_scene(folder.path());
     let export = |scene: &Path, format: &str, axis: &str, name: &str| {
         let mut export = splatvk();
-        export.arg("export").arg(scene).args(["--format", format, "--up", axis, "--force", "--out"]);
+        export.arg("export").arg(&scene).args(["--format", format, "--up", axis, "--force", "--out"]);
         export.arg(folder.path().join(name));
         export
     };
@@ -100,15 +101,32 @@ fn export_up_turns_scene() {
 }
 
 #[test]
-fn only_seen_export_omits_unseen() {
+fn export_omits_unseen() {
     let folder = tempfile::tempdir().unwrap();
     let (scene, out) = (tilted_scene(folder.path()).0, folder.path().join("seen.spz"));
     let mut export = splatvk();
-    export.arg("export").arg(scene).args(["--format", "spz", "--only-seen", "--out"]).arg(&out);
+    export.arg("export").arg(scene).args(["--format", "spz", "--out"]).arg(&out);
     let output = export.output().unwrap();
     assert!(output.status.success(), "{}", text(&output.stderr));
     let (kept, language) = splatvk::format::gaussians::read(&out).unwrap();
     assert_eq!((kept.len(), language.unwrap().levels[2].features.as_slice()), (1, &[0.5][..]));
+    // With what is guessed: the unseen splat, and those behind the scene, without features.
+    let out = folder.path().join("all.spz");
+    let backdrop = Splats {
+        means: vec![[0.0, 0.0, 9.0]; 2],
+        log_scales: vec![[0.0; 3]; 2],
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; 2],
+        opacity_logits: vec![2.0; 2],
+        sh: vec![0.1; 6],
+        ..Splats::default()
+    };
+    let options = PlyOptions { degree: 0, language: None };
+    splatvk::format::ply::write_splats(&scene.join("backdrop.ply"), &backdrop, options).unwrap();
+    let mut export = splatvk();
+    export.arg("export").arg(&scene).args(["--format", "spz", "--guessed", "--out"]).arg(&out);
+    assert!(export.output().unwrap().status.success());
+    let (all, language) = splatvk::format::gaussians::read(&out).unwrap();
+    assert_eq!((all.len(), language.unwrap().levels[2].features.len()), (4, 4));
 }
 
 #[test]

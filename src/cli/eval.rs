@@ -11,7 +11,7 @@ use crate::query::TextQuery;
 use crate::run::Compat;
 use crate::run::ask;
 use crate::run::encoder;
-use crate::run::score::{Questions, score_field};
+use crate::run::score::{Questions, ScoredScene, score_field};
 use crate::scene::LanguageField;
 use crate::{Error, Result};
 use serde::Serialize;
@@ -57,8 +57,7 @@ fn score_scene(scene: &Scene, args: &EvalArgs, out: Option<&WrittenFiles>) -> Re
     let field = scene.language.as_ref().unwrap_or(&no_language);
     score_field(
         &device,
-        &scene.splats,
-        field,
+        ScoredScene { splats: &scene.splats, backdrop: &scene.backdrop, field },
         Questions { queries: &queries, options: Compat::answers(args.compat.as_deref(), &args.scene)? },
         evaluation,
         args.refine_views,

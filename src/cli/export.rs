@@ -39,9 +39,12 @@ pub struct ExportArgs {
     /// ply: add the language features and codes as extra columns
     #[arg(long)]
     pub with_features: bool,
-    /// Leave out splats that no photo shows: surfaces continued beyond the photos and behind what
-    /// stands in front
+    /// Keep what no photo shows: surfaces continued beyond the photos and behind what stands in
+    /// front, and the blurred colours behind the scene
     #[arg(long)]
+    pub guessed: bool,
+    /// The default since guessed surfaces are left out; kept for scripts.
+    #[arg(long, hide = true, conflicts_with = "guessed")]
     pub only_seen: bool,
     /// Turn the scene so that up, where the scene states it, is this axis: -y (right, down,
     /// forward), y (right, up, back) or z (right, forward, up); spz, glb and gltf know only y
@@ -131,8 +134,10 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     let format = format(args)?;
     let out = Output::reserve(args, format)?;
     let mut scene = scene::load(&args.scene)?;
-    if args.only_seen {
-        keep_seen(&mut scene, args)?;
+    if args.guessed {
+        add_backdrop(&mut scene);
+    } else {
+        keep_seen(&mut scene);
     }
     let placement = placement(&scene, args, format)?;
     let mut points = match format.starts_with("colmap") {
@@ -281,19 +286,25 @@ fn warn_of_models(scene: &Scene) {
     }
 }
 
+/// Appends the backdrop, without language.
+fn add_backdrop(scene: &mut Scene) {
+    let (before, more) = (scene.splats.len(), std::mem::take(&mut scene.backdrop));
+    if more.is_empty() {
+        return;
+    }
+    scene.language = scene.language.take().map(|field| field.extended(&more, before));
+    scene.splats.append_raised(more);
+}
+
 /// Drops splats that no photo shows.
-fn keep_seen(scene: &mut Scene, args: &ExportArgs) -> Result<()> {
+fn keep_seen(scene: &mut Scene) {
+    // A bare file of Gaussians is exported as it is.
     if scene.seen.pixels.is_empty() {
-        return Err(Error::input(format!(
-            "{}: what the photos show of the scene is not known; leave --only-seen out, or make the scene again with this \
-             version",
-            args.scene.display()
-        )));
+        return;
     }
     let rows = scene.seen.rows(&scene.splats);
     scene.language = scene.language.take().map(|field| field.picked(&rows, scene.splats.len()));
     scene.splats = scene.splats.picked(&rows);
-    Ok(())
 }
 
 /// Upper bound of base colours in ordinary photos: of 145,000 splats of the breakfast scene one in

@@ -62,7 +62,7 @@ impl PathOutput {
 
     pub fn add(&mut self, camera: &Camera, view: &DecodedFrame) {
         self.rows.push(ViewRow { view: camera.name.clone(), score: self.views.score(camera, view) });
-        self.images.push(fitted(&view.rendered.rgb, self.cell));
+        self.images.push(fitted(view.picture(), self.cell));
     }
 
     /// Writes the sheet: four views per row, a photo and those up to the next one.
@@ -84,7 +84,7 @@ impl PathOutput {
         progress.begin("video", cameras.len() as u64);
         for (i, camera) in cameras.iter().enumerate() {
             progress.check()?;
-            video.frame(&viewer.view(camera)?.rendered.rgb)?;
+            video.frame(viewer.view(camera)?.picture())?;
             progress.step(i as u64 + 1, "");
         }
         progress.end();

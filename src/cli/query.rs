@@ -291,7 +291,7 @@ mod tests {
     fn place_json_states_units_and_metres() {
         let mut rendered = RenderedFrame::empty(4, 4, 0);
         rendered.depth.data.fill(4.0);
-        let frame = DecodedFrame { rendered, codes: Vec::new() };
+        let frame = DecodedFrame { rendered, codes: Vec::new(), filled: None };
         let (pose, size) = (Pose::IDENTITY, 4);
         let camera =
             Camera { name: "a".into(), width: size, height: size, fx: 4.0, fy: 4.0, cx: 0.5, cy: 1.5, pose };

@@ -45,7 +45,7 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     let no_language = LanguageField::default();
     let field = if wants_language { scene.language.as_ref().unwrap_or(&no_language) } else { &no_language };
     let device = gpu::open(args.device.device.as_deref())?;
-    let mut viewer = Viewer::new(&device, &scene.splats, field)?;
+    let mut viewer = Viewer::new(&device, &scene.splats, field)?.with_backdrop(&scene.backdrop)?;
     let mut unseen =
         wants_unseen.then(|| UnseenShare::new(&device, &scene.splats, &scene.seen)).transpose()?;
     let mut path = match args.path {
@@ -137,7 +137,7 @@ fn png(
     let frame = &view.rendered;
     for channel in channels {
         match channel {
-            Channel::Rgb => picture::write_png(&out.file(&format!("{stem}.png"))?, &frame.rgb)?,
+            Channel::Rgb => picture::write_png(&out.file(&format!("{stem}.png"))?, view.picture())?,
             Channel::Alpha => {
                 picture::write_grey_png(&out.file(&format!("{stem}_alpha.png"))?, &frame.alpha)?
             }

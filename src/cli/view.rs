@@ -44,7 +44,14 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     let site = Site {
         page: page(&scene, args, &names, no_questions.as_deref(), is_preview)?,
         scene_path: SCENE_PATH,
-        scene: viewer::pack(&scene.splats, &scene.seen, scene.language.as_ref(), usize::MAX)?.bytes,
+        scene: viewer::pack(
+            &scene.splats,
+            &scene.seen,
+            &scene.backdrop,
+            scene.language.as_ref(),
+            usize::MAX,
+        )?
+        .bytes,
         answers_questions: ready.is_some(),
     };
     let address = server.url();
@@ -112,6 +119,7 @@ fn page(
         title: &title,
         splats: &scene.splats,
         seen: &scene.seen,
+        backdrop: &scene.backdrop,
         cameras: &scene.cameras,
         world: &scene.world,
         photos: images.iter().collect(),

@@ -58,8 +58,10 @@ const LEAST_LENGTH: f64 = 0.1;
 /// One rendered frame.
 #[derive(Clone, Debug, Default)]
 pub struct Rendered {
-    /// Colours over the scene's background.
+    /// Colours over black.
     pub rgb: RgbImage,
+    /// Colours over the scene's backdrop, where it has one.
+    pub filled: Option<RgbImage>,
     /// Accumulated opacity.
     pub alpha: Image<f32>,
     /// Camera z in scene units, 0 = no surface.
@@ -249,7 +251,8 @@ impl Evaluation {
         let scale = self.similarity.scale as f32;
         let depth = rendered.depth.data.iter().map(|z| z * scale).collect();
         let depth = Image { data: depth, ..rendered.depth };
-        let view = Rendered { rgb: quantised(&rendered.rgb), alpha: rendered.alpha.clone(), depth };
+        let (rgb, alpha) = (quantised(&rendered.rgb), rendered.alpha.clone());
+        let view = Rendered { rgb, filled: None, alpha, depth };
         let psnr = |image: &RgbImage| metrics::psnr_masked(image, &target, |i| shown[i]);
         self.report.shown.push(FrameShown {
             frame: frame.stem.clone(),
@@ -286,7 +289,7 @@ impl Evaluation {
         out: Option<&Path>,
     ) -> Result<(ImageScore, Vec<MaskScore>)> {
         let target = self.truth.image(frame)?;
-        let shown = quantised(&rendered.rgb);
+        let shown = quantised(rendered.filled.as_ref().unwrap_or(&rendered.rgb));
         if (shown.width, shown.height) != (target.width, target.height) {
             return Err(Error::work(format!(
                 "{}: rendered {}x{}, the photo is {}x{}",

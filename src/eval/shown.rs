@@ -216,7 +216,7 @@ mod tests {
             (0..10, 5) => [0.9, 0.1, 0.1],
             _ => [0.5; 3],
         });
-        let view = Rendered { rgb, alpha, depth: wall.clone() };
+        let view = Rendered { rgb, filled: None, alpha, depth: wall.clone() };
         let shown = shown_pixels(&camera(0.0), &wall, &photos);
         let score = shown_score(&camera(0.0), &view, &shown, &photos);
         let row = 1.0 / HEIGHT as f64;

@@ -50,7 +50,7 @@ fn evaluation_scores_perfect_scene_perfectly() {
                 )
             })
             .collect();
-        eval.add_frame(&frame, &Rendered { rgb, alpha, depth }, &answers).unwrap();
+        eval.add_frame(&frame, &Rendered { rgb, filled: None, alpha, depth }, &answers).unwrap();
     }
     let direction = similarity.rotation.transpose() * truth.up.unwrap();
     let up = Some(Up { direction, sigma_degrees: 1.0, evidence: Vec::new() });

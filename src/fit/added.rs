@@ -2,11 +2,11 @@
 //! splats are trained further, and surfaces that it lacks become new splats.
 use super::bounds::Bounds;
 use super::half_res::Photos;
-use super::init::{raise_sh_degree, splats_from_points};
+use super::init::splats_from_points;
 use super::options::RgbOptions;
 use super::rgb::{Trained, fit_photos};
 use super::scale::SceneScale;
-use super::unseen::unseen_splats;
+use super::unseen::continued_surfaces;
 use crate::Result;
 use crate::gpu::Device;
 use crate::progress::Progress;
@@ -53,25 +53,16 @@ pub(crate) fn train_on(
 ) -> Result<Trained> {
     let mut start = scene;
     if fresh.len() >= MIN_POINTS {
-        append_splats(&mut start, splats_from_points(fresh, &options.init, options.seed)?);
+        start.append_raised(splats_from_points(fresh, &options.init, options.seed)?);
     }
     let surfaces = start.means.clone();
-    let Photos { images, cameras, depths, .. } = photos;
-    if let Some(depths) = depths.filter(|_| options.margin > 0.0 && !photos.show_emptiness()) {
-        let (reach, confidence) = (options.margin, options.min_confidence);
-        append_splats(&mut start, unseen_splats(images, cameras, depths, reach, confidence, options.seed));
-    }
+    let cameras = photos.cameras;
+    start.append_raised(continued_surfaces(&photos, options));
     if options.bounded {
         start = Bounds::new(cameras, &surfaces).clamp_to_bounds(start);
     }
     let scale = SceneScale::measure(cameras, &surfaces);
-    fit_photos(device, photos, start, scale, options, progress)
-}
-
-/// Appends splats of a lower or equal SH degree.
-fn append_splats(start: &mut Splats, mut more: Splats) {
-    raise_sh_degree(&mut more, start.sh_degree);
-    start.append(more);
+    Ok(fit_photos(device, photos, start, scale, options, progress)?.with_backdrop(&photos, options))
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 //! photos (docs/internals/method.md#splats-from-points).
 use super::options::InitOptions;
 use crate::math::Random;
-use crate::scene::{PointCloud, SH_C0, Splats, sh_coefficients};
+use crate::scene::{PointCloud, SH_C0, Splats};
 use crate::{Error, Result};
 use glam::Vec3;
 use rayon::prelude::*;
@@ -41,20 +41,6 @@ pub fn splats_from_points(points: &PointCloud, options: &InitOptions, seed: u64)
         splats.sh.extend(points.colours[i].map(|c| (c - 0.5) / SH_C0));
     }
     Ok(splats)
-}
-
-/// Adds zero coefficients up to `degree` (0–3).
-pub fn raise_sh_degree(splats: &mut Splats, degree: u32) {
-    let (old, new) = (3 * splats.sh_len(), 3 * sh_coefficients(degree.min(3)));
-    if new > old {
-        let mut sh = Vec::with_capacity(splats.len() * new);
-        for row in splats.sh.chunks_exact(old) {
-            sh.extend_from_slice(row);
-            sh.resize(sh.len() + new - old, 0.0);
-        }
-        splats.sh = sh;
-        splats.sh_degree = degree.min(3);
-    }
 }
 
 /// Reduces `candidates` to at most `max` points: the most confident point of every voxel, in voxels
@@ -292,18 +278,6 @@ mod tests {
         assert_eq!(splats.len(), 500);
         assert!(splats.means.contains(&[50.0, 50.0, 50.0]), "the only point of its region survives");
         assert_eq!(splats, splats_from_points(&points, &options, 1).unwrap(), "seeded");
-    }
-
-    #[test]
-    fn raise_sh_degree_keeps_colours() {
-        let mut splats =
-            Splats { means: vec![[0.0; 3]; 2], sh: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0], ..Splats::default() };
-        raise_sh_degree(&mut splats, 1);
-        assert_eq!((splats.sh.len(), splats.sh_degree), (24, 1));
-        assert_eq!(
-            (&splats.sh[..4], &splats.sh[12..16]),
-            (&[1.0, 2.0, 3.0, 0.0][..], &[4.0, 5.0, 6.0, 0.0][..])
-        );
     }
 
     #[test]

@@ -48,7 +48,7 @@ impl Rates {
 }
 
 /// Weight of the opacity loss.
-const OPACITY: Option<f64> = Some(0.1);
+const OPACITY: Option<f64> = Some(0.5);
 
 /// Options of [`super::train_rgb`].
 #[derive(Clone, Debug, PartialEq)]

@@ -11,7 +11,7 @@ use super::scale::SceneScale;
 use super::schedule::ViewOrder;
 use super::sh_degree::ViewDependence;
 use super::training::{self, StepReport, Trainer, Training};
-use super::unseen::unseen_splats;
+use super::unseen::{backdrop, continued_surfaces};
 use super::views::Views;
 use super::virtual_views::virtual_views;
 use crate::gpu::{Device, Recorder};
@@ -81,8 +81,24 @@ pub struct Trained {
     pub splats: Splats,
     /// Refined cameras; the first as given.
     pub cameras: Vec<Camera>,
+    /// Splats behind the scene, no part of it: blurred colours where neither a photo nor a continued
+    /// surface shows anything.
+    #[serde(default)]
+    pub backdrop: Splats,
     /// Statistics.
     pub stats: FitStats,
+}
+
+impl Trained {
+    /// Adds the backdrop. It is no part of training: before an opaque background surfaces would stay
+    /// transparent.
+    pub(super) fn with_backdrop(self, photos: &Photos, options: &RgbOptions) -> Trained {
+        if options.margin <= 0.0 || photos.show_emptiness() {
+            return self;
+        }
+        let photos = Photos { cameras: &self.cameras, ..*photos };
+        Trained { backdrop: backdrop(&photos, &self.splats.means), ..self }
+    }
 }
 
 /// Fits splats to photos. `depths`, if given, regularises where a view's depth is confident.
@@ -107,21 +123,17 @@ pub(crate) fn train_photos(
     options: &RgbOptions,
     progress: &dyn Progress,
 ) -> Result<Trained> {
-    let Photos { images, cameras, depths, .. } = photos;
+    let cameras = photos.cameras;
     progress.begin("initial splats", 2);
     let mut start = splats_from_points(points, &options.init, options.seed)?;
     progress.step(1, "");
-    // With an empty background, surfaces end at the silhouette.
-    if let Some(depths) = depths.filter(|_| options.margin > 0.0 && !photos.show_emptiness()) {
-        let (reach, confidence) = (options.margin, options.min_confidence);
-        start.append(unseen_splats(images, cameras, depths, reach, confidence, options.seed));
-    }
+    start.append(continued_surfaces(&photos, options));
     if options.bounded {
         start = Bounds::new(cameras, &points.positions).clamp_to_bounds(start);
     }
     let scale = SceneScale::of(cameras, points);
     progress.end();
-    fit_photos(device, photos, start, scale, options, progress)
+    Ok(fit_photos(device, photos, start, scale, options, progress)?.with_backdrop(&photos, options))
 }
 
 /// [`train_rgb`] from given splats instead of points, with their SH degree.
@@ -162,7 +174,7 @@ pub(crate) fn fit_photos(
         view_dependence: ViewDependence::default(),
         seconds: clock.elapsed().as_secs_f64(),
     };
-    Ok(Trained { splats, cameras, stats })
+    Ok(Trained { splats, cameras, backdrop: Splats::default(), stats })
 }
 
 impl Photos<'_> {

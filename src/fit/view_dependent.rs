@@ -1,7 +1,6 @@
 //! View-dependent colour (docs/internals/method.md#view-dependent-colour): spherical harmonics on a
 //! trained geometry, of the degree that left-out photos support.
 use super::half_res::Photos;
-use super::init::raise_sh_degree;
 use super::losses::Losses;
 use super::options::{Rates, RgbOptions};
 use super::rgb::{Trained, fit_photos};
@@ -110,7 +109,7 @@ impl Fit<'_> {
         degree: u32,
     ) -> Result<Trained> {
         let mut start = splats.clone();
-        raise_sh_degree(&mut start, degree);
+        start.raise_sh_degree(degree);
         let iterations = self.options.rounds * images.len();
         let options = RgbOptions {
             iterations,

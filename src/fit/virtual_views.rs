@@ -50,6 +50,17 @@ pub(super) fn virtual_views(photos: &Photos, count: usize, min_confidence: f32, 
     views
 }
 
+/// Number of views in which surfaces that no photo shows must not stand in front.
+const BESIDE: usize = 24;
+
+/// Cameras around photos, with the depth of the surfaces that the photos show there, 0 where they
+/// show none; at half the photos' size.
+pub(super) fn views_beside(photos: &Photos, min_confidence: f32, seed: u64) -> Vec<(Camera, DepthMap)> {
+    let half = OwnedPhotos::at_half_res(photos);
+    let views = virtual_views(&half.photos(), BESIDE, min_confidence, seed ^ 0x7be5);
+    views.cameras.into_iter().zip(views.depths.into_iter().flatten()).collect()
+}
+
 /// Cameras displaced from the photos in turn, to the left and to the right.
 fn around(photos: &[Camera], target: DVec3, count: usize, seed: u64) -> Vec<Camera> {
     let up = CameraOrbit::mean_up(photos).normalize_or(-DVec3::Y);

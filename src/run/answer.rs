@@ -302,7 +302,7 @@ mod tests {
         let none = Image::filled(SIZE, SIZE, -1);
         let mut rendered = RenderedFrame::empty(SIZE, SIZE, 0);
         rendered.depth.data.fill(1.0);
-        let frames = vec![DecodedFrame { rendered, codes: vec![none.clone(), none, codes] }];
+        let frames = vec![DecodedFrame { rendered, codes: vec![none.clone(), none, codes], filled: None }];
         let (size, focal) = (SIZE as u32, SIZE as f64);
         let cameras = vec![Camera {
             name: "a".into(),

@@ -212,6 +212,7 @@ impl Reconstruction<'_> {
             world: World { up: made.take(scene.up)?, scale: base.and_then(|b| b.world.scale.clone()) },
             splats,
             seen,
+            backdrop: trained.backdrop,
             rgb: trained.stats,
             psnr,
             frames,
@@ -248,6 +249,7 @@ fn write(workspace: Workspace, outcome: &RunOutcome, progress: &dyn Progress) ->
     let contents = Contents {
         splats: &outcome.splats,
         seen: &outcome.seen,
+        backdrop: &outcome.backdrop,
         cameras: &outcome.cameras,
         world: &outcome.world,
         photos: &outcome.photos,

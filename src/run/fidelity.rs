@@ -134,6 +134,7 @@ mod tests {
         let frame = |v: f32| DecodedFrame {
             rendered: RenderedFrame { rgb: image(v), ..RenderedFrame::default() },
             codes: Vec::new(),
+            filled: None,
         };
         let photos =
             ["a.png", "b.png"].map(|n| crate::photo::from_pixels(n.as_ref(), &image(0.5), None, 64).unwrap());

@@ -282,6 +282,7 @@ fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
     let contents = Contents {
         splats: &scene.splats,
         seen: &scene.seen,
+        backdrop: &scene.backdrop,
         cameras: &scene.cameras,
         world: &scene.world,
         photos: &photos,

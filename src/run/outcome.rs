@@ -40,6 +40,8 @@ pub struct RunOutcome {
     pub splats: Splats,
     /// Blending weight of the splats in the photos.
     pub seen: Seen,
+    /// Splats behind the scene, which no photo shows.
+    pub backdrop: Splats,
     /// Statistics of the colour stage.
     pub rgb: fit::FitStats,
     /// PSNR of the finished scene against every photo, dB.

@@ -62,6 +62,7 @@ impl Preview {
         let contents = Contents {
             splats: &splats,
             seen: &Seen::default(),
+            backdrop: &Default::default(),
             cameras: &geometry.cameras,
             world: &World::default(),
             photos: &placed.photos,

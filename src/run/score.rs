@@ -20,12 +20,22 @@ pub struct Questions<'a> {
     pub options: QueryOptions,
 }
 
+/// The scene that is scored.
+#[derive(Clone, Copy)]
+pub struct ScoredScene<'a> {
+    /// The Gaussians.
+    pub splats: &'a Splats,
+    /// Splats behind them; may be empty.
+    pub backdrop: &'a Splats,
+    /// Language; may be empty.
+    pub field: &'a LanguageField,
+}
+
 /// Scores a scene under protocol `field`. With `refine`, held-out frames are scored a second time
 /// from refined cameras. Every decoded frame is passed to `visit`.
 pub fn score_field(
     device: &Device,
-    splats: &Splats,
-    field: &LanguageField,
+    ScoredScene { splats, backdrop, field }: ScoredScene,
     Questions { queries, options }: Questions,
     mut evaluation: Evaluation,
     refine: bool,
@@ -40,7 +50,7 @@ pub fn score_field(
         Ok(places.instances(&selection.splats, selection.level))
     };
     evaluation.add_instances(&queries.iter().map(instances).collect::<Result<Vec<_>>>()?)?;
-    let mut viewer = Viewer::new(device, splats, field)?;
+    let mut viewer = Viewer::new(device, splats, field)?.with_backdrop(backdrop)?;
     let refiner = if refine { Some(ViewRefiner::new(device, splats)?) } else { None };
     let frames = evaluation.cameras();
     progress.begin("eval", frames.len() as u64);
@@ -78,7 +88,8 @@ pub fn score_field(
 /// The images of a frame that are scored.
 pub(super) fn rendered(view: &DecodedFrame) -> Rendered {
     let frame = &view.rendered;
-    Rendered { rgb: frame.rgb.clone(), alpha: frame.alpha.clone(), depth: frame.depth.clone() }
+    let (rgb, filled) = (frame.rgb.clone(), view.filled.clone());
+    Rendered { rgb, filled, alpha: frame.alpha.clone(), depth: frame.depth.clone() }
 }
 
 /// Returns the frame from the refined camera if it is closer to the photo, and the displacement of
@@ -138,9 +149,9 @@ mod tests {
         let evaluation = Evaluation::new(GroundTruth::read(folder.path()).unwrap(), &scene, None).unwrap();
         let field = LanguageField::default();
         let no_queries = Questions { queries: &[], options: QueryOptions::default() };
+        let scene = ScoredScene { splats: &splats, backdrop: &Splats::default(), field: &field };
         let report =
-            score_field(&device, &splats, &field, no_queries, evaluation, true, &Silent, &mut |_, _| Ok(()))
-                .unwrap();
+            score_field(&device, scene, no_queries, evaluation, true, &Silent, &mut |_, _| Ok(())).unwrap();
         let given = report.images.iter().find(|i| i.split == Split::Test).unwrap().psnr_colour_fit;
         let refined = report.refined.unwrap();
         let (view, score) = (&refined.views[0], refined.images[0].psnr_colour_fit);

@@ -259,6 +259,7 @@ fn scene<'a>(title: &'a str, photos: &'a [RgbImage], o: &'a RunOutcome) -> Scene
         title,
         splats: &o.splats,
         seen: &o.seen,
+        backdrop: &o.backdrop,
         cameras: &o.cameras,
         world: &o.world,
         photos: photos.iter().collect(),

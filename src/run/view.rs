@@ -8,7 +8,7 @@ use crate::pass::raster_forward::BASE_CHANNELS;
 use crate::pass::rasterizer::FrameBuffers;
 use crate::pass::renderer::{RenderedFrame, Renderer};
 use crate::progress::Progress;
-use crate::scene::{Camera, Image, LanguageField, SH_C0, Seen, Splats};
+use crate::scene::{Camera, Image, LanguageField, RgbImage, SH_C0, Seen, Splats};
 use std::ops::Range;
 
 /// A rendered frame and the code of every pixel per level (−1 = none).
@@ -20,6 +20,15 @@ pub struct DecodedFrame {
     /// Per level, index as in [`crate::scene::LEVEL_NAMES`]; levels without codes are −1
     /// everywhere.
     pub codes: Vec<Image<i32>>,
+    /// Colours with the backdrop behind them, from a viewer with one.
+    pub filled: Option<RgbImage>,
+}
+
+impl DecodedFrame {
+    /// The picture for people: with the backdrop, where there is one.
+    pub fn picture(&self) -> &RgbImage {
+        self.filled.as_ref().unwrap_or(&self.rendered.rgb)
+    }
 }
 
 /// Renders and decodes cameras one by one, both on the device.
@@ -27,6 +36,8 @@ pub struct Viewer {
     device: Device,
     /// The scene's own splats first, then those of levels with splats of their own.
     models: Vec<Model>,
+    /// Splats behind the scene.
+    backdrop: Option<Renderer>,
     /// Number of levels of the field.
     levels: usize,
     /// Decoded codes at the size of the last view.
@@ -118,7 +129,16 @@ impl Viewer {
             let carrier = field.levels[level].carrier(splats);
             models.push(Model::new(device, carrier, field, &[level], &shown)?);
         }
-        Ok(Viewer { device: device.clone(), models, levels: shown.len(), output: None })
+        Ok(Viewer { device: device.clone(), models, backdrop: None, levels: shown.len(), output: None })
+    }
+
+    /// Draws the splats of a backdrop behind the scene in [`DecodedFrame::picture`]; depth, opacity
+    /// and codes stay those of the scene.
+    pub fn with_backdrop(mut self, backdrop: &Splats) -> Result<Self> {
+        if !backdrop.is_empty() {
+            self.backdrop = Some(Renderer::new(&self.device, backdrop, &[], 0)?);
+        }
+        Ok(self)
     }
 
     /// Renders and decodes the scene from one camera.
@@ -166,7 +186,11 @@ impl Viewer {
         let (w, h) = (camera.width as usize, camera.height as usize);
         let mut rendered = RenderedFrame::empty(w, h, if features { width } else { 0 });
         let codes = self.decode_view(camera, Some(&mut rendered))?;
-        Ok(DecodedFrame { rendered, codes })
+        let filled = match &mut self.backdrop {
+            Some(renderer) => Some(over(&rendered, &renderer.render(camera)?.rgb)),
+            None => None,
+        };
+        Ok(DecodedFrame { rendered, codes, filled })
     }
 
     /// Renders the models that `shown` or the codes need, and reads the parts that `shown` has room
@@ -209,6 +233,13 @@ impl Viewer {
         }
         Ok(codes)
     }
+}
+
+/// Colours of a frame over those behind it.
+fn over(front: &RenderedFrame, behind: &RgbImage) -> RgbImage {
+    let blend = |((c, a), b): ((&[f32; 3], &f32), &[f32; 3])| [0, 1, 2].map(|k| c[k] + (1.0 - a) * b[k]);
+    let pixels = front.rgb.data.iter().zip(&front.alpha.data).zip(&behind.data);
+    RgbImage { data: pixels.map(blend).collect(), ..front.rgb }
 }
 
 /// Decodes the levels of a band into `codes`; `output` keeps the buffer for the next band of the

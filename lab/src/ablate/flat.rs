@@ -58,7 +58,7 @@ pub(super) fn field(
         }
         let depth = Image::filled(rgb.width, rgb.height, 0.0);
         let alpha = Image::filled(rgb.width, rgb.height, 1.0);
-        evaluation.add_frame(frame, &Rendered { rgb, alpha, depth }, &answers)?;
+        evaluation.add_frame(frame, &Rendered { rgb, filled: None, alpha, depth }, &answers)?;
         progress.step(k as u64 + 1, "");
     }
     progress.end();

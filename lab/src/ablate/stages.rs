@@ -12,7 +12,7 @@ use splatvk::photo::Photo;
 use splatvk::photo::stem;
 use splatvk::pipeline::{Context, Lane, Output, Stage};
 use splatvk::query::{QueryOptions, TextQuery};
-use splatvk::run::score::{Questions, score_field};
+use splatvk::run::score::{Questions, ScoredScene, score_field};
 use splatvk::run::stages::{PlacedPhotos, SharedEncoder};
 use splatvk::run::view::Viewer;
 use splatvk::scene::{Codebook, Image};
@@ -199,8 +199,7 @@ impl Stage for Score {
         let whole = levels.iter().rposition(|l| !l.codebook.is_empty());
         let report = score_field(
             context.device,
-            &language.splats,
-            &language.field,
+            ScoredScene { splats: &language.splats, backdrop: &trained.backdrop, field: &language.field },
             Questions { queries: &self.queries, options: QueryOptions::default() },
             evaluation,
             false,

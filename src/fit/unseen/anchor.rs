@@ -5,7 +5,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 /// Grid of the splats in units of the longer image side: only the mean colour is known, so finer
 /// splats add no detail.
-pub(super) const STEP: f64 = 0.01;
+pub(super) const STEP: f64 = 0.015;
 /// Least depth of a splat behind a surface, relative to the surface: above stereo noise.
 pub(super) const BEHIND: f64 = 1.05;
 
@@ -20,6 +20,9 @@ const SAMPLES: usize = 30;
 /// Largest colour distance (L2) between a pixel and the border on one surface, including its
 /// texture and shading.
 const ALIKE: f32 = 0.25;
+
+/// Number of neighbouring anchors of which the typical one continues.
+const NEIGHBOURS: usize = 7;
 
 /// Photo with camera and depth.
 pub(super) struct Shown<'a> {
@@ -64,6 +67,19 @@ impl Anchor {
             }
         }
         (total > 0.0).then(|| Anchor { at, w, slope, colour: colour.map(|c| (c / total) as f32) })
+    }
+
+    /// Of the anchors nearest to the border position `at`, the one with the median depth at a pixel
+    /// beyond: a plane fitted to noise does not continue.
+    pub(super) fn typical(anchors: &[Anchor], at: DVec2, pixel: DVec2) -> Option<&Anchor> {
+        let mut near: Vec<&Anchor> = anchors.iter().collect();
+        let squared = |a: &&Anchor| a.at.distance_squared(at);
+        if near.len() > NEIGHBOURS {
+            near.select_nth_unstable_by(NEIGHBOURS, |a, b| squared(a).total_cmp(&squared(b)));
+            near.truncate(NEIGHBOURS);
+        }
+        near.sort_by(|a, b| a.inverse(pixel).total_cmp(&b.inverse(pixel)));
+        near.get(near.len() / 2).copied()
     }
 
     /// Anchor nearest to a position.

@@ -6,9 +6,15 @@
 //! border or at a depth edge, in its mean colour. They are in no training view, so they do not
 //! change the loss.
 mod anchor;
+mod backdrop;
 
 use crate::math::Random;
 use crate::scene::{Camera, DepthMap, RgbImage, SH_C0, Splats};
+pub(super) use backdrop::backdrop;
+
+use super::half_res::Photos;
+use super::options::RgbOptions;
+use super::virtual_views::views_beside;
 use anchor::{Anchor, BEHIND, STEP, Shown};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
@@ -18,27 +24,47 @@ use std::collections::HashSet;
 /// 55°, a camera that orbits the front object by 20° uncovers 0.12 of a surface at 1.5 times its
 /// depth.
 const REVEALED: f64 = 0.12;
-/// Standard deviation in units of the grid; at 0.7, neighbours blend without gaps.
-const OVERLAP: f64 = 0.7;
-/// Opacity logit of these splats: about 0.98.
-const LOGIT: f32 = 4.0;
+/// Standard deviation in units of the grid: splats of cells that touch at a corner blend without
+/// gaps.
+const OVERLAP: f64 = 1.0;
+/// Opacity next to the end of a surface.
+const OPACITY: f64 = 0.98;
+/// Share of the reach from which the opacity falls, to [`LEAST_OPACITY`] at its end.
+const FADES_FROM: f64 = 0.4;
+const LEAST_OPACITY: f64 = 0.02;
 
 /// Candidate splat.
 struct UnseenSplat {
     /// Distance from the end of the surface, pixels.
     distance: f64,
+    /// The same over the reach.
+    share: f64,
     position: DVec3,
     /// World steps of one grid cell along x and y.
     steps: [DVec3; 2],
     colour: [f32; 3],
 }
 
+/// Surfaces that continue those of photos; empty without depth, with a margin of 0, and with an
+/// empty background, where surfaces end at the silhouette.
+pub(super) fn continued_surfaces(photos: &Photos, options: &RgbOptions) -> Splats {
+    let Photos { images, cameras, depths: Some(depths), .. } = *photos else { return Splats::default() };
+    if options.margin <= 0.0 || photos.show_emptiness() {
+        return Splats::default();
+    }
+    let (reach, confidence) = (options.margin, options.min_confidence);
+    let beside = views_beside(photos, confidence, options.seed);
+    unseen_splats(images, cameras, depths, &beside, reach, confidence, options.seed)
+}
+
 /// Creates flat splats around all photos and behind their depth edges, up to `reach` times the
-/// longer side from the end of a surface. Depth below `min_confidence` is ignored.
-pub fn unseen_splats(
+/// longer side from the end of a surface. None stands before a surface that a photo shows, neither
+/// from the photos nor from the views `beside` them. Depth below `min_confidence` is ignored.
+fn unseen_splats(
     images: &[RgbImage],
     cameras: &[Camera],
     depths: &[DepthMap],
+    beside: &[(Camera, DepthMap)],
     reach: f64,
     min_confidence: f32,
     seed: u64,
@@ -48,7 +74,14 @@ pub fn unseen_splats(
             Shown { image: &images[view], camera: &cameras[view], depth: &depths[view], min_confidence };
         let mut random = Random::new(seed ^ 0x3a61 ^ ((view as u64) << 32));
         let mut own = candidates(&shown, reach * shown.long(), &mut random);
-        own.retain(|c| !(0..depths.len()).any(|v| v != view && in_the_way(c, &cameras[v], &depths[v])));
+        let in_photo = |c: &UnseenSplat, v: usize| {
+            depth_at(c, &cameras[v], &depths[v]).is_some_and(|(z, known)| known <= 0.0 || z < BEHIND * known)
+        };
+        let in_view = |c: &UnseenSplat, (camera, depth): &(Camera, DepthMap)| {
+            depth_at(c, camera, depth).is_some_and(|(z, known)| known > 0.0 && z < known / BEHIND)
+        };
+        own.retain(|c| !(0..depths.len()).any(|v| v != view && in_photo(c, v)));
+        own.retain(|c| !beside.iter().any(|v| in_view(c, v)));
         own
     };
     let views = images.len().min(depths.len());
@@ -60,7 +93,7 @@ pub fn unseen_splats(
     for c in &all {
         let size = c.steps[0].length().min(c.steps[1].length()).max(1e-12);
         let octave = size.log2().round();
-        let cell = (c.position / (octave.exp2() * 1.5)).floor().as_i64vec3();
+        let cell = (c.position / (octave.exp2())).floor().as_i64vec3();
         if taken.insert((octave as i64, cell)) {
             push(&mut splats, c);
         }
@@ -74,28 +107,29 @@ fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<UnseenSplat
     let size = shown.size();
     // Hidden surfaces appear in narrow gaps, so their grid is twice as fine as beyond the borders.
     let (step, fine) = (STEP * shown.long(), 0.5 * STEP * shown.long());
+    let revealed = REVEALED * shown.long();
     let borders = anchor::at_border(shown, random);
     let edges = anchor::at_edges(shown, fine, random);
-    let continued = |anchor: &Anchor, pixel: DVec2, step: f64| {
-        candidate(shown.camera, anchor, pixel, anchor.at.distance(pixel), step)
+    let continued = |anchor: &Anchor, pixel: DVec2, step: f64, reach: f64| {
+        candidate(shown.camera, anchor, pixel, reach, step)
     };
     let beyond = |pixel: DVec2| -> Option<[Option<UnseenSplat>; 2]> {
         let border = pixel.clamp(DVec2::ZERO, size);
         let outside = border != pixel && border.distance(pixel) < reach;
-        let front = Anchor::nearest(borders.iter(), border).filter(|_| outside)?;
+        let front = Anchor::typical(&borders, border, pixel).filter(|_| outside)?;
         // The front surface may end there, so the next one behind it continues, too.
         let next = borders.iter().chain(&edges).filter(|a| a.inverse(pixel) * BEHIND < front.inverse(pixel));
         let next = Anchor::nearest(next, pixel).filter(|a| a.at.distance(pixel) < reach);
-        Some([continued(front, pixel, step), next.and_then(|a| continued(a, pixel, step))])
+        Some([continued(front, pixel, step, reach), next.and_then(|a| continued(a, pixel, step, reach))])
     };
     let behind = |pixel: DVec2| -> Option<UnseenSplat> {
         let depth = shown.depth_at(pixel.x as usize, pixel.y as usize);
         // Only behind the visible surface: a continuation on it would shine through splats that
         // training leaves transparent.
         let next = Anchor::nearest(edges.iter(), pixel)
-            .filter(|a| a.at.distance(pixel) < REVEALED * shown.long())
+            .filter(|a| a.at.distance(pixel) < revealed)
             .filter(|a| depth.is_some_and(|z| a.inverse(pixel) * z * BEHIND < 1.0));
-        next.and_then(|a| continued(a, pixel, fine))
+        next.and_then(|a| continued(a, pixel, fine, revealed))
     };
     let outer: Vec<DVec2> = shown.cells(step, reach).collect();
     let inner: Vec<DVec2> = shown.cells(fine, 0.0).filter(|p| p.x < size.x && p.y < size.y).collect();
@@ -103,26 +137,17 @@ fn candidates(shown: &Shown, reach: f64, random: &mut Random) -> Vec<UnseenSplat
     outer.chain(inner.into_par_iter().filter_map(behind)).collect()
 }
 
-/// True where a candidate is in front of or on a surface of another photo, or at a pixel of unknown
-/// depth.
-fn in_the_way(c: &UnseenSplat, camera: &Camera, depth: &DepthMap) -> bool {
+/// Depth of a candidate in a view, and of the surface at its pixel, 0 where that is unknown; `None`
+/// outside of the view.
+fn depth_at(c: &UnseenSplat, camera: &Camera, map: &DepthMap) -> Option<(f64, f64)> {
     let (pixel, z) = camera.project(c.position);
-    let (w, h) = (f64::from(camera.width), f64::from(camera.height));
-    if z <= 0.0 || pixel.x < 0.0 || pixel.y < 0.0 || pixel.x >= w || pixel.y >= h {
-        return false;
-    }
-    let known = f64::from(depth.depth.at(pixel.x as usize, pixel.y as usize));
-    known <= 0.0 || z < BEHIND * known
+    let (w, h) = (map.depth.width as f64, map.depth.height as f64);
+    let inside = z > 0.0 && pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < w && pixel.y < h;
+    inside.then(|| (z, f64::from(map.depth.at(pixel.x as usize, pixel.y as usize))))
 }
 
 /// Candidate that continues the plane of an anchor at a pixel; `None` near or past the horizon.
-fn candidate(
-    camera: &Camera,
-    anchor: &Anchor,
-    pixel: DVec2,
-    distance: f64,
-    step: f64,
-) -> Option<UnseenSplat> {
+fn candidate(camera: &Camera, anchor: &Anchor, pixel: DVec2, reach: f64, step: f64) -> Option<UnseenSplat> {
     // Planes beyond three times the depth of their end, or nearer than half of it, are unreliable.
     let value = anchor.inverse(pixel);
     if value < anchor.w / 3.0 || value > anchor.w * 2.0 {
@@ -131,7 +156,8 @@ fn candidate(
     let world = |p: DVec2| camera.unproject(p, 1.0 / anchor.inverse(p).max(anchor.w / 4.0));
     let position = world(pixel);
     let steps = [DVec2::X, DVec2::Y].map(|e| world(pixel + 0.5 * step * e) - world(pixel - 0.5 * step * e));
-    Some(UnseenSplat { distance, position, steps, colour: anchor.colour })
+    let distance = anchor.at.distance(pixel);
+    Some(UnseenSplat { distance, share: distance / reach, position, steps, colour: anchor.colour })
 }
 
 /// Appends a flat splat that spans one grid cell of the plane.
@@ -152,7 +178,9 @@ fn push(splats: &mut Splats, c: &UnseenSplat) {
     splats.means.push(c.position.as_vec3().into());
     splats.log_scales.push(sizes.map(|s| s.max(1e-12).ln() as f32));
     splats.quats.push([q.w as f32, q.x as f32, q.y as f32, q.z as f32]);
-    splats.opacity_logits.push(LOGIT);
+    let faded = ((c.share - FADES_FROM) / (1.0 - FADES_FROM)).clamp(0.0, 1.0);
+    let opacity = (OPACITY * (1.0 - faded)).max(LEAST_OPACITY);
+    splats.opacity_logits.push((opacity / (1.0 - opacity)).ln() as f32);
     splats.sh.extend(c.colour.map(|v| (v - 0.5) / SH_C0));
 }
 
@@ -198,7 +226,7 @@ mod tests {
         let n = DVec3::new(0.1, -0.3, 1.0).normalize();
         let (image, depth) = scene(n, 3.0);
         let known = depth.clone();
-        let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
+        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, 0);
         // 32 px around 160 × 120 on a grid of 1.6 px is about 7000 cells (rounded corners).
         assert!(splats.len() > 2500, "{}", splats.len());
         let mut off = 0;
@@ -227,7 +255,7 @@ mod tests {
             depth.depth.data[i] *= 0.6;
             image.data[i] = [0.9, 0.1, 0.1];
         }
-        let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
+        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, 0);
         let mut behind = 0;
         for (mean, sh) in splats.means.iter().zip(splats.sh.chunks(3)) {
             let p = DVec3::from(mean.map(f64::from));
@@ -267,7 +295,7 @@ mod tests {
         // A wall above and a nearer one below row 60: beyond the left border both continue, since
         // the nearer one may end.
         let (image, depth) = walls(|_, y| if y < 60 { (3.0, [0.2; 3]) } else { (1.8, [0.8; 3]) });
-        let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
+        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, 0);
         let below: Vec<_> = places(&splats)
             .into_iter()
             .filter(|(p, ..)| (-20.0..-1.0).contains(&p.x) && (63.0..75.0).contains(&p.y))
@@ -286,7 +314,7 @@ mod tests {
             (20..60, true) => (1.5, [0.9, 0.1, 0.1]),
             _ => (3.0, [0.5; 3]),
         });
-        let splats = unseen_splats(&[image], &[camera()], &[depth], 0.2, 0.5, 0);
+        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, 0);
         let left: Vec<_> = places(&splats).into_iter().filter(|(p, ..)| p.x < -1.0).collect();
         assert!(left.len() > 500, "{}", left.len());
         for (pixel, z, red) in left {
@@ -316,9 +344,9 @@ mod tests {
         };
         let (images, depths) = ([image.clone(), image], [depth, farther]);
         let cameras = [camera(), beside];
-        let alone = unseen_splats(&images[..1], &cameras, &depths[..1], 0.2, 0.5, 0);
+        let alone = unseen_splats(&images[..1], &cameras, &depths[..1], &[], 0.2, 0.5, 0);
         assert!(before(&alone, &cameras[1], &depths[1]) > 100, "the first photo alone knows no better");
-        let splats = unseen_splats(&images, &cameras, &depths, 0.2, 0.5, 0);
+        let splats = unseen_splats(&images, &cameras, &depths, &[], 0.2, 0.5, 0);
         assert!(splats.len() > 1000);
         for (camera, depth) in cameras.iter().zip(&depths) {
             assert_eq!(before(&splats, camera, depth), 0);

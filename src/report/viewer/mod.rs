@@ -89,6 +89,8 @@ pub struct Scene3d<'a> {
     pub splats: &'a Splats,
     /// Visibility of the splats in the photos.
     pub seen: &'a Seen,
+    /// Splats behind the scene; may be empty.
+    pub backdrop: &'a Splats,
     /// Cameras of the photos.
     pub cameras: &'a [Camera],
     /// World frame of the scene.
@@ -106,7 +108,7 @@ pub struct Scene3d<'a> {
 impl Scene3d<'_> {
     /// Section for a static page with the splats, and a note about it.
     pub fn embedded(&self) -> Result<(String, String)> {
-        let packed = pack(self.splats, self.seen, self.language, REPORT_SPLATS)?;
+        let packed = pack(self.splats, self.seen, self.backdrop, self.language, REPORT_SPLATS)?;
         let data = STANDARD.encode(&packed.bytes);
         let note = format!(
             "{} of {} splats, {:.1} MB in this page. splatvk view SCENE shows all of them and answers any question.",
@@ -144,7 +146,7 @@ impl Scene3d<'_> {
             "title": self.title, "live": false, "ask_note": ask_note,
             "names_note": if words { "" } else { "This text model brings no phrases of its own: ask, and they appear here." },
             "views": views.collect::<Result<Vec<_>>>()?,
-            "unseen": self.seen.unseen(),
+            "unseen": self.seen.unseen() + self.backdrop.len(),
             "metres": self.world.scale.as_ref().map(|s| s.metres_per_unit),
             "up": self.world.up.as_ref().map(|u| u.direction.to_array()),
             "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at)).collect::<Vec<_>>(),
@@ -218,6 +220,7 @@ mod tests {
             title: "a<b",
             splats: &splats,
             seen: &Seen::default(),
+            backdrop: &Splats::default(),
             cameras: std::slice::from_ref(&camera),
             world: &World { scale: Some(scale), ..World::default() },
             photos: vec![&photo],

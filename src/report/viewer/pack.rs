@@ -42,12 +42,26 @@ pub struct Packed {
     pub total: usize,
 }
 
-/// Packs at most `most` splats, those of the largest opacity times area.
-pub fn pack(splats: &Splats, seen: &Seen, language: Option<&LanguageField>, most: usize) -> Result<Packed> {
-    let order = morton_order(splats, most_visible(splats, most));
+/// Packs at most `most` splats, those of the largest opacity times area. The `backdrop` counts as
+/// unseen.
+pub fn pack(
+    splats: &Splats,
+    seen: &Seen,
+    backdrop: &Splats,
+    language: Option<&LanguageField>,
+    most: usize,
+) -> Result<Packed> {
+    let (mut all, mut visible) = (splats.clone(), seen.clone());
+    if !backdrop.is_empty() {
+        all.append_raised(backdrop.clone());
+        // Splats of unknown visibility count as seen.
+        visible.pixels.resize(splats.len(), f32::MAX);
+        visible.pixels.resize(all.len(), 0.0);
+    }
+    let order = morton_order(&all, most_visible(&all, most));
     let levels: Vec<&LevelField> = language.map_or(Vec::new(), |f| f.levels.iter().collect());
-    let raw = write(splats, seen, &levels, &order);
-    Ok(Packed { bytes: gzip(&raw)?, shown: order.len(), total: splats.len() })
+    let raw = write(&all, &visible, &levels, &order);
+    Ok(Packed { bytes: gzip(&raw)?, shown: order.len(), total: all.len() })
 }
 
 /// Bytes that are deflated as one part: parts cannot refer to each other, which costs a window of
@@ -309,7 +323,7 @@ mod tests {
         let field = LanguageField { levels: vec![level, LevelField::default()], space: String::new() };
         let order = morton_order(&splats, most_visible(&splats, usize::MAX));
         let seen = Seen { pixels: (0..700).map(|i| (i % 2) as f32).collect() };
-        let packed = pack(&splats, &seen, Some(&field), usize::MAX).unwrap();
+        let packed = pack(&splats, &seen, &Splats::default(), Some(&field), usize::MAX).unwrap();
         let n = order.len();
         assert_eq!((packed.shown, packed.total), (n, 700));
         let raw = unpacked(&packed);
@@ -387,7 +401,8 @@ mod tests {
             assert_eq!(r.u8(), u8::from(s % 2 == 0), "even ones are in no photo");
         }
         assert!(r.0.is_empty());
-        let unknown = unpacked(&pack(&splats, &Seen::default(), Some(&field), usize::MAX).unwrap());
+        let unknown =
+            unpacked(&pack(&splats, &Seen::default(), &Splats::default(), Some(&field), usize::MAX).unwrap());
         assert_eq!((unknown[20], unknown.len()), (0, raw.len() - n), "no row where nothing is known");
     }
 

@@ -17,7 +17,7 @@ const canvas = find("canvas");
 const { views, levels } = manifest;
 const up = manifest.up || upOf(views);
 
-const state = { mode: "colour", level: levels.findLastIndex((l) => l.colours.length), selected: null, picked: null, query: null, guessed: false };
+const state = { mode: "colour", level: levels.findLastIndex((l) => l.colours.length), selected: null, picked: null, query: null, guessed: true };
 const STALE = 0, ROUGH = 1, SHARP = 2;
 let splats, extent, renderer, motion, worker, near = 0.01;
 let request = 0, sortedFor = -1, waiting = false, drawn = STALE, capturing = false;
@@ -74,7 +74,7 @@ function restore() {
 
 /// Sets the pivot of a camera to the surface in the middle of its image.
 function aimAt(which) {
-  const hit = pick(splats, which, 320, 240, 640, 480, near, showsGuessed());
+  const hit = pick(splats, which, 320, 240, 640, 480, near, false);
   if (hit) which.distance = hit.depth;
 }
 
@@ -112,7 +112,7 @@ function changed() {
   drawn = STALE;
 }
 
-/// Whether what no photo shows is in the picture: in colour it is a grey veil over the rest.
+/// Whether what no photo shows is in the picture.
 const showsGuessed = () => state.guessed || state.mode !== "colour";
 
 function draw(camera, lean = false) {
@@ -381,7 +381,7 @@ function levelOf(codes) {
 
 /// Depth and codes at a position of the canvas, CSS pixels.
 function hitAt(x, y) {
-  return pick(splats, motion.camera, x, y, ...size(), near, showsGuessed());
+  return pick(splats, motion.camera, x, y, ...size(), near, state.mode === "unseen");
 }
 
 const placeAt = (x, y, depth) => motion.camera.unproject(x, y, depth, ...size());

@@ -30,6 +30,9 @@ pub(super) const SPLATS: &str = "point_cloud.ply";
 /// Blending weight of every splat in the photos, [N] f32 ([`Seen`]).
 pub(super) const SEEN: &str = "seen.npy";
 
+/// Splats behind the scene, which are no part of it: blurred colours of what lies around.
+pub(super) const BACKDROP: &str = "backdrop.ply";
+
 /// A loaded scene.
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
@@ -40,6 +43,8 @@ pub struct Scene {
     pub splats: Splats,
     /// Blending weights of the splats in the photos.
     pub seen: Seen,
+    /// Splats behind the scene, which no photo shows; empty for a bare PLY.
+    pub backdrop: Splats,
     /// Training cameras at working resolution; empty for a bare PLY.
     pub cameras: Vec<Camera>,
     /// Direction up and scale, where known.
@@ -95,6 +100,8 @@ pub struct Contents<'a> {
     pub splats: &'a Splats,
     /// Blending weights of the splats in the photos.
     pub seen: &'a Seen,
+    /// Splats behind the scene; may be empty.
+    pub backdrop: &'a Splats,
     /// One per photo, at working resolution.
     pub cameras: &'a [Camera],
     /// Direction up and scale of the scene.
@@ -116,6 +123,11 @@ pub fn write(folder: &Path, c: &Contents) -> Result<()> {
     ply::write_splats(&folder.join(SPLATS), c.splats, ply::PlyOptions::default())?;
     if !c.seen.pixels.is_empty() {
         npy::write(folder.join(SEEN), &NpyArray::f32(&[c.seen.pixels.len()], c.seen.pixels.clone()))?;
+    }
+    if !c.backdrop.is_empty() {
+        // In its own degree: it is drawn behind the scene, not opened alone.
+        let options = ply::PlyOptions { degree: c.backdrop.sh_degree, language: None };
+        ply::write_splats(&folder.join(BACKDROP), c.backdrop, options)?;
     }
     let camera_folder = folder.join("cameras");
     create_folder(&camera_folder)?;
@@ -242,8 +254,11 @@ pub fn load(path: &Path) -> Result<Scene> {
     let splats = cut_degree(splats, manifest.sh_degree);
     let language = manifest.language.map(|m| read_language(path, &m, splats.len())).transpose()?;
     let seen = read_seen(path, splats.len())?;
+    // Scenes of earlier versions lack the file.
+    let backdrop = path.join(BACKDROP);
+    let backdrop = if is_missing(&backdrop) { Splats::default() } else { read_own(&backdrop)? };
     let world = manifest.world;
-    Ok(Scene { path: path.into(), splats, seen, cameras, world, language, warnings: Vec::new() })
+    Ok(Scene { path: path.into(), splats, seen, backdrop, cameras, world, language, warnings: Vec::new() })
 }
 
 /// Reads Gaussians of this program: all of them or none.
@@ -253,11 +268,15 @@ fn read_own(path: &Path) -> Result<Splats> {
     Ok(splats)
 }
 
+/// A folder or a pipe in the place of a file does not count as missing.
+fn is_missing(file: &Path) -> bool {
+    file.symlink_metadata().is_err_and(|e| e.kind() == std::io::ErrorKind::NotFound)
+}
+
 /// Reads [`SEEN`]; scenes of earlier versions lack the file.
 fn read_seen(folder: &Path, splats: usize) -> Result<Seen> {
     let file = folder.join(SEEN);
-    // A folder or a pipe in its place does not count as missing.
-    if file.symlink_metadata().is_err_and(|e| e.kind() == std::io::ErrorKind::NotFound) {
+    if is_missing(&file) {
         return Ok(Seen::default());
     }
     let array = npy::read(&file)?;

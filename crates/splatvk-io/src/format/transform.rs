@@ -1,4 +1,5 @@
 //! Similarity transforms and mirroring of Gaussians.
+use crate::math::sphere_directions;
 use crate::scene::sh;
 use crate::scene::{Similarity, Splats};
 use glam::{DMat3, DQuat, DVec3, Vec3};
@@ -60,10 +61,11 @@ pub fn mirror_z(splats: &mut Splats) {
 /// functions of one degree, so that least squares over some directions are exact.
 fn turned_basis(rotation: &DMat3, degree: u32) -> DMatrix<f64> {
     let functions = 2 * degree as usize + 1;
+    let directions: Vec<DVec3> = sphere_directions(DIRECTIONS).collect();
     let first = (degree * degree) as usize;
     let basis_values = |turn: DMat3| {
         DMatrix::from_fn(DIRECTIONS, functions, |row, column| {
-            sh::basis(turn * spiral_direction(row), degree)[first + column]
+            sh::basis(turn * directions[row], degree)[first + column]
         })
     };
     let (new, old) = (basis_values(DMat3::IDENTITY), basis_values(rotation.transpose()));
@@ -71,14 +73,6 @@ fn turned_basis(rotation: &DMat3, degree: u32) -> DMatrix<f64> {
     // The directions are spread over the sphere, so the functions are well conditioned there.
     let inverse = squares.try_inverse().unwrap_or_else(|| DMatrix::identity(functions, functions));
     inverse * new.transpose() * old
-}
-
-/// Direction `k` of a spiral over the sphere.
-fn spiral_direction(k: usize) -> DVec3 {
-    let z = 1.0 - (2 * k + 1) as f64 / DIRECTIONS as f64;
-    let (sin, cos) = (k as f64 * 2.399_963_229_728_653).sin_cos();
-    let r = (1.0 - z * z).sqrt();
-    DVec3::new(r * cos, r * sin, z)
 }
 
 #[cfg(test)]
@@ -104,11 +98,11 @@ mod tests {
             let b = sh::basis(d, 3);
             (0..16).map(|k| b[k] * f64::from(sh[3 * k + channel])).sum::<f64>()
         };
-        for k in 0..DIRECTIONS {
-            let d = DMat3::from_rotation_y(0.4) * spiral_direction(k);
+        for direction in sphere_directions(DIRECTIONS) {
+            let d = DMat3::from_rotation_y(0.4) * direction;
             for channel in 0..3 {
                 let (before, after) = (colour(&sh, d, channel), colour(&s.sh, rotation * d, channel));
-                assert!((before - after).abs() < 1e-5, "direction {k}: {before} {after}");
+                assert!((before - after).abs() < 1e-5, "direction {direction}: {before} {after}");
             }
         }
         // Covariance: R S Sᵀ Rᵀ rotates and scales with the scene.
@@ -139,11 +133,11 @@ mod tests {
         mirror_z(&mut s);
         assert_eq!(s.means[0], [1.0, -2.0, -3.0]);
         let mirror = DMat3::from_diagonal(DVec3::new(1.0, 1.0, -1.0));
-        for k in 0..DIRECTIONS {
-            let d = DMat3::from_rotation_y(0.4) * spiral_direction(k);
+        for direction in sphere_directions(DIRECTIONS) {
+            let d = DMat3::from_rotation_y(0.4) * direction;
             let colour =
                 |sh: &[f32], d| (0..16).map(|k| sh::basis(d, 3)[k] * f64::from(sh[3 * k])).sum::<f64>();
-            assert!((colour(&sh, d) - colour(&s.sh, mirror * d)).abs() < 1e-6, "direction {k}");
+            assert!((colour(&sh, d) - colour(&s.sh, mirror * d)).abs() < 1e-6, "direction {direction}");
         }
         let covariance = |q: [f32; 4]| {
             let [w, x, y, z] = q.map(f64::from);

@@ -139,6 +139,7 @@ mod tests {
         let contents = Contents {
             splats: &splats,
             seen: &crate::scene::Seen::default(),
+            backdrop: &Default::default(),
             cameras: std::slice::from_ref(&camera),
             world: &Default::default(),
             photos: &[],

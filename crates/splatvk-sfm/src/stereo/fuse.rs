@@ -10,11 +10,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const FLYING: f32 = 0.06;
 /// Least confidence of a matched pixel; filled ones have less.
 pub const MATCHED: f32 = 0.5;
+/// Distance of the points of sky, pixels.
+const SKY_STEP: usize = 3;
 
 /// Fuses matched pixels of all views first, then filled ones; within each, views by decreasing mean
 /// confidence. A pixel is skipped if a kept point projects onto it at the same depth within the
-/// view's tolerance.
-pub fn fuse(level: &Level, poses: &RelativePoses, surface: &Surface) -> PointCloud {
+/// view's tolerance. `sky` is smooth: a pixel in `SKY_STEP` per row and column suffices.
+pub fn fuse(level: &Level, poses: &RelativePoses, surface: &Surface, sky: &[bool]) -> PointCloud {
     let mut order: Vec<usize> = (0..level.cameras.len()).collect();
     let mean_confidence = |view: usize| {
         let r = &level.references[view];
@@ -27,7 +29,7 @@ pub fn fuse(level: &Level, poses: &RelativePoses, surface: &Surface) -> PointClo
     let mut kept: Vec<(usize, Vec<Vec3>)> = Vec::new();
     for matched in [true, false] {
         for &view in &order {
-            let points = fuse_view(level, poses, surface, view, matched, &kept, &mut cloud);
+            let points = fuse_view(level, poses, surface, sky, view, matched, &kept, &mut cloud);
             kept.push((view, points));
         }
     }
@@ -38,6 +40,7 @@ fn fuse_view(
     level: &Level,
     poses: &RelativePoses,
     surface: &Surface,
+    sky: &[bool],
     view: usize,
     matched: bool,
     kept: &[(usize, Vec<Vec3>)],
@@ -64,9 +67,12 @@ fn fuse_view(
     for (other, points) in kept {
         points.par_iter().with_min_len(1024).for_each(|point| cover(*other, *point));
     }
+    let is_sky = |k: usize| sky[r.first as usize + k];
+    let skipped = |k: usize| is_sky(k) && (k % width % SKY_STEP, k / width % SKY_STEP) != (1, 1);
     let is_new = |k: &usize| {
         let (z, confidence) = (depth.data[*k], surface.confidence[r.first as usize + k]);
         z > 0.0
+            && !skipped(*k)
             && (confidence >= MATCHED) == matched
             && !covered[*k].load(Ordering::Relaxed)
             && !neighbours(*k, width, height)
@@ -83,7 +89,8 @@ fn fuse_view(
         cloud.colours.push(level.guide[view].data[k]);
         cloud.confidence.push(confidence);
         cloud.view.push(view as u8);
-        cloud.radius.push(z / r.intrinsics[0]);
+        let pixels = if is_sky(k) { SKY_STEP as f32 } else { 1.0 };
+        cloud.radius.push(pixels * z / r.intrinsics[0]);
     }
     added
 }

@@ -9,6 +9,7 @@ mod options;
 mod planes;
 mod prior;
 mod regions;
+mod sky;
 mod surface;
 #[cfg(test)]
 mod tests;
@@ -47,7 +48,7 @@ pub fn dense(
     let finest = &levels[levels.len() - 1];
     // The segmentation needs no depth, so it runs while the device matches.
     let (planes, segments) = std::thread::scope(|scope| {
-        let segments = scope.spawn(|| PhotoSegments::new(finest, coverage));
+        let segments = scope.spawn(|| PhotoSegments::new(finest, coverage, sparse));
         let planes = run_schedule(&levels, options, progress, |level, start| {
             sweep.matcher(&level.luma, &level.references, &level.sources, &start)
         });
@@ -63,6 +64,8 @@ pub fn dense(
 pub struct PhotoSegments {
     /// Pixels that are neither matched nor filled.
     void: Vec<bool>,
+    /// Sky, which is not matched.
+    sky: sky::Sky,
     /// Pixels of weak texture.
     weak: Vec<bool>,
     /// Areas of even colour, per view.
@@ -70,11 +73,13 @@ pub struct PhotoSegments {
 }
 
 impl PhotoSegments {
-    /// Segments all views of a level; `coverage` has an entry per view or none.
-    pub fn new(level: &Level, coverage: &[Option<Coverage>]) -> PhotoSegments {
+    /// Segments all views of a level; `coverage` has an entry per view or none. `sparse` are points
+    /// of the scene in world coordinates.
+    pub fn new(level: &Level, coverage: &[Option<Coverage>], sparse: &[DVec3]) -> PhotoSegments {
         let weak = texture::weak(level);
         let areas = regions::segment(level, &weak);
-        PhotoSegments { void: void::unused(level, coverage), weak, areas }
+        let void = void::unused(level, coverage);
+        PhotoSegments { sky: sky::Sky::find(level, sparse, &void), void, weak, areas }
     }
 }
 
@@ -143,9 +148,10 @@ pub fn finish(
     progress: &dyn Progress,
 ) -> (Vec<DepthMap>, PointCloud) {
     progress.begin("surfaces", SURFACE_STEPS);
-    let PhotoSegments { void, weak, areas } = segments;
+    let PhotoSegments { void, sky, weak, areas } = segments;
     let poses = surface::RelativePoses::new(level);
-    let consistent = surface::consistent_surface(level, &poses, matched, void, weak);
+    let no_match: Vec<bool> = void.iter().zip(&sky.pixels).map(|(void, sky)| *void || *sky).collect();
+    let consistent = surface::consistent_surface(level, &poses, matched, &no_match, weak);
     progress.step(1, "planes");
     let fitted = surface::smoothed(level, &consistent, FIT_RADIUS);
     let (large, inferred) = rayon::join(
@@ -153,10 +159,11 @@ pub fn finish(
         || {
             let trimmed = fill::without_depth_edges(level, &fitted, depth_edge_radius(level));
             progress.step(2, "regions");
-            regions::fill(level, &poses, &trimmed, void, areas, options.seed)
+            regions::fill(level, &poses, &trimmed, &no_match, areas, options.seed)
         },
     );
     let fused = prior::fuse_priors(level, &poses, &inferred, priors, options.seed, progress);
+    let fused = sky.added_to(level, fused);
     progress.step(3, "filling");
     let complete = fill::fill(level, &poses, &fused, &large, void);
     let complete = match faces::faces(level, &poses, &fused, &complete, &large, options.seed) {
@@ -164,7 +171,7 @@ pub fn finish(
         None => complete,
     };
     progress.step(4, "points");
-    let points = fuse::fuse(level, &poses, &complete);
+    let points = fuse::fuse(level, &poses, &complete, &sky.pixels);
     let mut depths: Vec<DepthMap> =
         images.par_iter().enumerate().map(|(view, image)| depth_map(level, &complete, view, image)).collect();
     for (depth, coverage) in depths.iter_mut().zip(coverage) {

@@ -65,7 +65,7 @@ fn fuse_skips_flying_pixels() {
         surface.planes[k] = glam::Vec3::Z / depth(k % 32);
         surface.confidence[k] = 0.9;
     }
-    let points = fuse::fuse(level, &surface::RelativePoses::new(level), &surface);
+    let points = fuse::fuse(level, &surface::RelativePoses::new(level), &surface, &vec![false; pixels]);
     let depths = points.positions.iter().map(|p| level.cameras[0].project(DVec3::from(p.map(f64::from))).1);
     let count_at = |z: f64| depths.clone().filter(|d| (d / z - 1.0).abs() < 1e-4).count();
     // The columns on both sides of a step are skipped, too.

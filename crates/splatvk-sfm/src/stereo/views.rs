@@ -124,7 +124,7 @@ fn inverse_depth_range(camera: &Camera, sparse: &[DVec3]) -> Result<[f64; 2]> {
 }
 
 /// True if a point projects into a camera's image.
-fn in_image(camera: &Camera, p: DVec3) -> bool {
+pub fn in_image(camera: &Camera, p: DVec3) -> bool {
     let (pixel, z) = camera.project(p);
     let (w, h) = (camera.width as f64, camera.height as f64);
     z > 0.0 && pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < w && pixel.y < h
@@ -154,7 +154,7 @@ fn choose_sources(view: usize, cameras: &[Camera], sparse: &[DVec3], count: usiz
 }
 
 /// Half the size, 2 × 2 means; an odd last row or column is dropped.
-fn halved(image: &RgbImage) -> RgbImage {
+pub fn halved(image: &RgbImage) -> RgbImage {
     let (width, height) = (image.width / 2, image.height / 2);
     let mut data = Vec::with_capacity(width * height);
     for y in 0..height {

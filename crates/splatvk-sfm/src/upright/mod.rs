@@ -3,6 +3,7 @@ mod clues;
 mod planes;
 
 use super::segments::{self, END_SIGMA};
+use crate::math::sphere_directions;
 use crate::scene::{Camera, PointCloud, RgbImage, Up, UpEvidence};
 use clues::{Agreement, EdgePlane, Evidence, Refined};
 use glam::DVec3;
@@ -72,17 +73,8 @@ fn gather(
     evidence
 }
 
-/// Directions over the sphere at 2.2° (Fibonacci lattice).
-fn sphere() -> impl Iterator<Item = DVec3> {
-    const N: usize = 8000;
-    (0..N).map(|k| {
-        let z = 1.0 - (2 * k + 1) as f64 / N as f64;
-        let (sin, cos) = (k as f64 * 2.399_963_229_728_653).sin_cos();
-        let r = (1.0 - z * z).sqrt();
-        DVec3::new(r * cos, r * sin, z)
-    })
-}
-
+/// Number of directions that are searched: 2.2° apart.
+const DIRECTIONS: usize = 8000;
 /// `blur` of the search and the refinement, radians: 2.5° exceeds the pitch of the directions.
 const BLURS: [f64; 3] = [0.044, 0.02, 0.0];
 /// Least angle between candidates, radians (6°).
@@ -97,8 +89,10 @@ const STEPS: usize = 4;
 
 /// Local maxima of the score over directions, best first.
 fn candidates(evidence: &Evidence) -> Vec<(Refined, Agreement)> {
-    let mut coarse: Vec<(DVec3, f64)> =
-        sphere().map(|v| (v, evidence.agreement(v, BLURS[0]).score())).filter(|c| c.1 > WORTH).collect();
+    let mut coarse: Vec<(DVec3, f64)> = sphere_directions(DIRECTIONS)
+        .map(|v| (v, evidence.agreement(v, BLURS[0]).score()))
+        .filter(|c| c.1 > WORTH)
+        .collect();
     coarse.sort_by(|a, b| b.1.total_cmp(&a.1));
     let mut found: Vec<(Refined, Agreement)> = Vec::new();
     let mut tried: Vec<DVec3> = Vec::new();

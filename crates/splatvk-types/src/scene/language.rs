@@ -135,6 +135,26 @@ impl LevelField {
     }
 }
 
+impl LevelField {
+    /// The level with `more` splats without features after its `splats`.
+    fn extended(mut self, more: &Splats, splats: usize) -> LevelField {
+        let width = self.features.len() / splats.max(1);
+        self.features.resize(self.features.len() + width * more.len(), 0.0);
+        if !self.mixes.is_empty() {
+            let none = self.codebook.len() as u16;
+            let no_feature = CodeMix { first: none, second: none, share: 0 };
+            self.mixes.resize(self.mixes.len() + more.len(), no_feature);
+        }
+        if !self.reliability.is_empty() {
+            self.reliability.resize(self.reliability.len() + more.len(), 0.0);
+        }
+        if let Some(own) = &mut self.splats {
+            own.append_raised(more.clone());
+        }
+        self
+    }
+}
+
 /// All levels (index as in [`LEVEL_NAMES`]); a level without masks has an empty codebook.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct LanguageField {
@@ -146,6 +166,11 @@ pub struct LanguageField {
 }
 
 impl LanguageField {
+    /// The field of a scene of `splats` after `more` splats without language are appended.
+    pub fn extended(self, more: &Splats, splats: usize) -> LanguageField {
+        LanguageField { levels: self.levels.into_iter().map(|l| l.extended(more, splats)).collect(), ..self }
+    }
+
     /// The field of the given rows of a scene's `splats`, in their order.
     pub fn picked(self, rows: &[usize], splats: usize) -> LanguageField {
         LanguageField { levels: self.levels.into_iter().map(|l| l.picked(rows, splats)).collect(), ..self }

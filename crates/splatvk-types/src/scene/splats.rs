@@ -60,6 +60,25 @@ impl Splats {
         self.opacity_logits.append(&mut other.opacity_logits);
         self.sh.append(&mut other.sh);
     }
+    /// Appends splats of a lower or equal SH degree.
+    pub fn append_raised(&mut self, mut other: Splats) {
+        other.raise_sh_degree(self.sh_degree);
+        other.antialiased = self.antialiased;
+        self.append(other);
+    }
+    /// Adds zero coefficients up to `degree` (0–3).
+    pub fn raise_sh_degree(&mut self, degree: u32) {
+        let (old, new) = (3 * self.sh_len(), 3 * sh_coefficients(degree.min(3)));
+        if new > old {
+            let mut sh = Vec::with_capacity(self.len() * new);
+            for row in self.sh.chunks_exact(old) {
+                sh.extend_from_slice(row);
+                sh.resize(sh.len() + new - old, 0.0);
+            }
+            self.sh = sh;
+            self.sh_degree = degree.min(3);
+        }
+    }
     /// The given rows, in their order.
     pub fn picked(&self, rows: &[usize]) -> Splats {
         let width = 3 * self.sh_len();
@@ -76,5 +95,22 @@ impl Splats {
     /// Coefficients per channel.
     pub fn sh_len(&self) -> usize {
         sh_coefficients(self.sh_degree)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn raise_sh_degree_keeps_colours() {
+        let mut splats =
+            Splats { means: vec![[0.0; 3]; 2], sh: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0], ..Splats::default() };
+        splats.raise_sh_degree(1);
+        assert_eq!((splats.sh.len(), splats.sh_degree), (24, 1));
+        assert_eq!(
+            (&splats.sh[..4], &splats.sh[12..16]),
+            (&[1.0, 2.0, 3.0, 0.0][..], &[4.0, 5.0, 6.0, 0.0][..])
+        );
     }
 }

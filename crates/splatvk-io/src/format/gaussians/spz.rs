@@ -327,8 +327,8 @@ pub fn write_splats(path: &Path, s: &Splats, version: u32) -> Result<()> {
     }
     let bits = fraction_bits(s).ok_or_else(|| {
         Error::input(format!(
-            "the scene reaches {:.1e} units from its origin and .spz ends at {FIXED_MAX:.1e}; leave out what no photo shows \
-             (--only-seen) or write another format (--format ply)",
+            "the scene reaches {:.1e} units from its origin and .spz ends at {FIXED_MAX:.1e}; write another format \
+             (--format ply)",
             widest(s)
         ))
     })?;
