@@ -299,6 +299,7 @@ fn model_per_level_decodes_as_trained() {
     let contents = Contents {
         splats: &trained.splats,
         seen: &seen,
+        backdrop: &Default::default(),
         cameras: &cameras,
         world: &World::default(),
         photos: &[],
