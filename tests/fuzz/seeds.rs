@@ -216,6 +216,7 @@ fn scene_files() -> Vec<(String, Vec<u8>)> {
     let contents = Contents {
         splats: &s,
         seen: &Seen { pixels: vec![3.0; 6] },
+        backdrop: &Default::default(),
         cameras: &[named("a.png"), named("b.png")],
         world: &World::default(),
         photos: &photos,
