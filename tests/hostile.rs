@@ -246,6 +246,7 @@ fn write_scene(folder: &Path, s: &Splats, field: Option<&LanguageField>) {
     let contents = scene_dir::Contents {
         splats: s,
         seen: &Seen::default(),
+        backdrop: &Default::default(),
         cameras: &[camera],
         world: &World::default(),
         photos: &[],

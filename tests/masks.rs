@@ -255,6 +255,7 @@ fn scene_keeps_pixel_coverage() {
         let contents = Contents {
             splats: &splats,
             seen: &Seen { pixels: vec![3.0] },
+            backdrop: &Default::default(),
             cameras: &[camera("a.png"), camera("b.png")],
             world: &World::default(),
             photos: &photos,

@@ -404,6 +404,7 @@ fn static_page_answers_stored_queries() {
         title: "static",
         splats: &scene.splats,
         seen: &seen,
+        backdrop: &Default::default(),
         cameras: &scene.cameras,
         world: &scene.world,
         photos: Vec::new(),

@@ -54,6 +54,7 @@ fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
     let contents = Contents {
         splats: &splats,
         seen: &Seen { pixels: vec![0.0, 3.0] },
+        backdrop: &Default::default(),
         cameras: std::slice::from_ref(&camera),
         world: &World { up: Some(up), ..World::default() },
         photos: &[],
@@ -105,7 +106,7 @@ fn export_omits_unseen() {
     let folder = tempfile::tempdir().unwrap();
     let (scene, out) = (tilted_scene(folder.path()).0, folder.path().join("seen.spz"));
     let mut export = splatvk();
-    export.arg("export").arg(scene).args(["--format", "spz", "--out"]).arg(&out);
+    export.arg("export").arg(&scene).args(["--format", "spz", "--out"]).arg(&out);
     let output = export.output().unwrap();
     assert!(output.status.success(), "{}", text(&output.stderr));
     let (kept, language) = splatvk::format::gaussians::read(&out).unwrap();

@@ -371,6 +371,7 @@ fn scene_directory_round_trips() {
     let contents = scene_dir::Contents {
         splats: &s,
         seen: &seen,
+        backdrop: &Default::default(),
         cameras: &cams,
         world: &world,
         photos: &photos,
