@@ -1,6 +1,6 @@
 #version 460
 // One Adam step on `count` parameters (shared/adam.glsl). The host computes the bias corrections in
-// f64 and writes rates[slot] = (head rate, tail rate, second, unused) before each step, so one
+// f64 and writes rates[slot] = (head rate, tail rate, second, eps) before each step, so one
 // recording serves all steps: the rates include 1/(1-beta1^t), second is 1/sqrt(1-beta2^t).
 // The first `head` of every `stride` parameters use the head rate, the others the tail rate (SH: DC
 // and the rest). The guard is the status of the rasteriser: a frame whose tile lists overflowed has
@@ -36,7 +36,7 @@ void main() {
         rate[k] = column < head ? step_rates.x : step_rates.y;
         column = column + 1u == stride ? 0u : column + 1u;
     }
-    bvec4 finite = adam(parameter, pair, gradient, rate, step_rates.z);
+    bvec4 finite = adam(parameter, pair, gradient, rate, step_rates.z, step_rates.w);
     [[unroll]] for (uint k = 0u; k < 4u; k++) bad += finite[k] || 4u * i + k >= count ? 0u : 1u;
     parameters[i] = parameter;
     moments[2u * i] = pair[0];

@@ -121,7 +121,7 @@ const uint SH_BATCH = SH_DEGREE == 0 ? 1 : 3;
                     gradient[c] = GRADIENT; \
                     rate[c] = RATE; \
                 } \
-                bvec4 finite = adam(parameter[b], pair[b], gradient, rate, row.z); \
+                bvec4 finite = adam(parameter[b], pair[b], gradient, rate, row.z, row.w); \
                 if (!all(finite)) { \
                     uvec4 bad = uvec4(not(finite)); \
                     atomicAdd(faults[0], bad.x + bad.y + bad.z + bad.w); \

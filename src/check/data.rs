@@ -87,7 +87,7 @@ pub(super) fn adam(device: &Device) -> Found {
         schedule.record(&mut rec, class, &parameters, &gradients, &moments, &guard);
         rec.run()?;
         let g: Vec<f64> = g.iter().map(|&v| v.into()).collect();
-        adam::adam(&mut expected, &g, &mut state, 1e-2, step);
+        adam::adam(&mut expected, &g, &mut state, 1e-2, adam::EPSILON, step);
     }
     // Three steps of 1e-2 on numbers around 1, rounded to f32.
     let tolerance =

@@ -2,7 +2,7 @@
 use super::compared::{Found, close, equal, worst};
 use crate::gpu::{Device, KernelVariant, Recorder};
 use crate::math::Random;
-use crate::pass::adam::{BETA, Moments, Schedule, adam};
+use crate::pass::adam::{BETA, EPSILON, Moments, Schedule, adam};
 use crate::pass::close::{IMAGE, Tolerance, gradient_tolerance};
 use crate::pass::fused_update::{self, ROWS, SplatAdam, flat};
 use crate::pass::params::Params;
@@ -197,7 +197,14 @@ pub(super) fn update(device: &Device) -> Found {
             .enumerate()
             .map(|(i, g)| {
                 let (mut p, mut mv) = ([start[class][i]], [[0.0; 2]]);
-                adam(&mut p, &[f64::from(*g)], &mut mv, rates[class][usize::from(i % width >= 3)], 1);
+                adam(
+                    &mut p,
+                    &[f64::from(*g)],
+                    &mut mv,
+                    rates[class][usize::from(i % width >= 3)],
+                    EPSILON,
+                    1,
+                );
                 p[0]
             })
             .collect();

@@ -38,7 +38,7 @@ impl Losses {
     /// Warped photos: their edges are less sharp than those of photos, and their depth is the
     /// depth that warps them.
     pub(super) const VIRTUAL: Losses =
-        Losses { l1: 0.4, dssim: 0.0, depth: Some(0.02), needles: Some(1e-3), opacity: Some(0.25) };
+        Losses { l1: 0.4, dssim: 0.0, depth: Some(0.02), needles: Some(1e-3), opacity: Some(0.75) };
 
     /// Alpha that the objective asks of the pixels of a photo, −1 where it asks for none, and its
     /// weight per pixel.

@@ -1,13 +1,14 @@
 //! Splat parameters in GPU memory with their gradients and optimiser state, which pruning moves
 //! together.
+use super::losses::Losses;
 use super::options::Rates;
 use crate::gpu::{self, Buffer, Device, Recorder};
-use crate::pass::adam::{Class, Moments, Schedule};
+use crate::pass::adam::{Class, EPSILON, Moments, Schedule};
 use crate::pass::compact;
 use crate::pass::fused_update::{ROWS, SplatAdam, UpdateKernel};
 use crate::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
 use crate::pass::regularise::{self, RatioPenalty};
-use crate::scene::Splats;
+use crate::scene::{SH_C0, Splats};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -104,6 +105,15 @@ impl Model {
             values,
             step: 0,
         })
+    }
+
+    /// Keeps the colour of splats that cover less than about `pixels` of a photo of `size` pixels:
+    /// Adam moves by the rate however small the gradient, so that colours that leave no trace would
+    /// drift.
+    pub(super) fn hold_colours_below(&mut self, pixels: f64, size: usize) {
+        // Gradient by the lowest coefficient of a splat with that blending weight, of the L1 loss.
+        let gradient = Losses::PHOTOS.l1 * f64::from(SH_C0) / 3.0 * pixels / size.max(1) as f64;
+        self.schedule.set_epsilon(ROWS[4], gradient.max(EPSILON));
     }
 
     /// Number of splats.

@@ -250,7 +250,8 @@ impl<'a> Run<'a> {
             let losses = (&Losses::VIRTUAL, options.min_confidence);
             views.add(device, virtual_views.photos(), losses, start.len(), 0)?;
         }
-        let model = Model::new(device, start, 0)?;
+        let mut model = Model::new(device, start, 0)?;
+        model.hold_colours_below(options.colour_pixels, photos.images.first().map_or(1, |i| i.data.len()));
         let order = ViewOrder::new(photos.cameras.len(), virtual_views.cameras.len(), options.seed);
         let cameras = [first.cameras, &virtual_views.cameras].concat();
         let trainer = Trainer::new(device, raster, model, views, cameras, order);

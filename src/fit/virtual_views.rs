@@ -22,6 +22,16 @@ const DISTANCE: [f64; 2] = [0.8, 1.25];
 /// Warps photos to `count` cameras around them, at their size. Pixels that no photo shows without
 /// contradiction are not used. Empty without depth.
 pub(super) fn virtual_views(photos: &Photos, count: usize, min_confidence: f32, seed: u64) -> OwnedPhotos {
+    warped_views(photos, count, ELEVATION, min_confidence, seed)
+}
+
+fn warped_views(
+    photos: &Photos,
+    count: usize,
+    elevation: [f64; 2],
+    min_confidence: f32,
+    seed: u64,
+) -> OwnedPhotos {
     let mut views = OwnedPhotos::default();
     let Photos { images, cameras, depths: Some(depths), coverage } = *photos else { return views };
     let with_depth = images.iter().zip(cameras).zip(depths).enumerate();
@@ -37,7 +47,7 @@ pub(super) fn virtual_views(photos: &Photos, count: usize, min_confidence: f32, 
         return views;
     }
     let target = targets.iter().sum::<DVec3>() / targets.len() as f64;
-    let cameras = around(cameras, target, count, seed);
+    let cameras = around(cameras, target, elevation, count, seed);
     let mut all_depths = Vec::new();
     for camera in cameras {
         let Warped { image, depth, used } = warp(&surfaces, &camera);
@@ -57,12 +67,14 @@ const BESIDE: usize = 24;
 /// show none; at half the photos' size.
 pub(super) fn views_beside(photos: &Photos, min_confidence: f32, seed: u64) -> Vec<(Camera, DepthMap)> {
     let half = OwnedPhotos::at_half_res(photos);
-    let views = virtual_views(&half.photos(), BESIDE, min_confidence, seed ^ 0x7be5);
+    // From below the ground, its continuation stands in front of everything.
+    let elevation = [0.0, ELEVATION[1]];
+    let views = warped_views(&half.photos(), BESIDE, elevation, min_confidence, seed ^ 0x7be5);
     views.cameras.into_iter().zip(views.depths.into_iter().flatten()).collect()
 }
 
 /// Cameras displaced from the photos in turn, to the left and to the right.
-fn around(photos: &[Camera], target: DVec3, count: usize, seed: u64) -> Vec<Camera> {
+fn around(photos: &[Camera], target: DVec3, elevation: [f64; 2], count: usize, seed: u64) -> Vec<Camera> {
     let up = CameraOrbit::mean_up(photos).normalize_or(-DVec3::Y);
     let orbit = CameraOrbit::new(photos, target, up);
     let mut random = Random::new(seed ^ 0x51de);
@@ -70,7 +82,7 @@ fn around(photos: &[Camera], target: DVec3, count: usize, seed: u64) -> Vec<Came
         .map(|k| {
             let side = if (k / photos.len()).is_multiple_of(2) { 1.0 } else { -1.0 };
             let azimuth = side * random.between(AZIMUTH[0], AZIMUTH[1]);
-            let elevation = random.between(ELEVATION[0], ELEVATION[1]);
+            let elevation = random.between(elevation[0], elevation[1]);
             let distance = random.between(DISTANCE[0], DISTANCE[1]);
             orbit.displaced(&photos[k % photos.len()], azimuth, elevation, distance)
         })

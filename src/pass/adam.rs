@@ -6,8 +6,9 @@ use crate::gpu::{Buffer, Device, Recorder, shaders};
 
 /// β1, β2 of every 3D Gaussian splatting implementation.
 pub const BETA: [f64; 2] = [shaders::shared::adam::BETA1, shaders::shared::adam::BETA2];
-/// ε: tiny, since gradients are (Kerbl et al. 2023 use 1e-15).
-pub const EPSILON: f64 = shaders::shared::adam::EPS;
+/// ε of every class unless [`Schedule::set_epsilon`] states another: tiny, since gradients are
+/// (Kerbl et al. 2023).
+pub const EPSILON: f64 = 1e-15;
 /// Threads per workgroup in `glsl/adam.comp` and `glsl/gather.comp`.
 const GROUP: usize = shaders::adam::WORKGROUP[0] as usize;
 
@@ -58,14 +59,19 @@ impl Schedule {
         Ok(Schedule {
             rates: device.buffer::<f32>("adam rates", 4 * classes)?,
             faults: device.buffer::<u32>("adam faults", 1)?,
-            rows: vec![[0.0; 4]; classes],
+            rows: vec![[0.0, 0.0, 0.0, EPSILON as f32]; classes],
         })
+    }
+
+    /// Sets ε of a class: parameters whose gradients are smaller hardly move.
+    pub fn set_epsilon(&mut self, slot: u32, epsilon: f64) {
+        self.rows[slot as usize][3] = epsilon as f32;
     }
 
     /// Writes the rates (head, tail) of every class for the 1-based `step` of the moments.
     pub fn set(&mut self, step: usize, rates: &[[f64; 2]]) -> Result<()> {
         for (row, rate) in self.rows.iter_mut().zip(rates) {
-            *row = row_of(step, *rate);
+            *row = row_of(step, *rate, row[3]);
         }
         Ok(self.rates.write(self.rows.as_flattened())?)
     }
@@ -107,16 +113,23 @@ impl Schedule {
     }
 }
 
-/// (head, tail, second-moment correction) for a 1-based step.
-fn row_of(step: usize, rate: [f64; 2]) -> [f32; 4] {
+/// (head, tail, second-moment correction, ε) for a 1-based step.
+fn row_of(step: usize, rate: [f64; 2], epsilon: f32) -> [f32; 4] {
     let t = step.max(1) as f64;
     let first = 1.0 / (1.0 - BETA[0].powf(t));
     let second = 1.0 / (1.0 - BETA[1].powf(t)).sqrt();
-    [(rate[0] * first) as f32, (rate[1] * first) as f32, second as f32, 0.0]
+    [(rate[0] * first) as f32, (rate[1] * first) as f32, second as f32, epsilon]
 }
 
 /// CPU reference of one step for one class with one rate; `moments` are (m, v).
-pub fn adam(parameters: &mut [f64], gradients: &[f64], moments: &mut [[f64; 2]], rate: f64, step: usize) {
+pub fn adam(
+    parameters: &mut [f64],
+    gradients: &[f64],
+    moments: &mut [[f64; 2]],
+    rate: f64,
+    epsilon: f64,
+    step: usize,
+) {
     let t = step.max(1) as f64;
     for ((p, &g), mv) in parameters.iter_mut().zip(gradients).zip(moments) {
         if !g.is_finite() {
@@ -125,7 +138,7 @@ pub fn adam(parameters: &mut [f64], gradients: &[f64], moments: &mut [[f64; 2]],
         mv[0] = BETA[0] * mv[0] + (1.0 - BETA[0]) * g;
         mv[1] = BETA[1] * mv[1] + (1.0 - BETA[1]) * g * g;
         let (m, v) = (mv[0] / (1.0 - BETA[0].powf(t)), mv[1] / (1.0 - BETA[1].powf(t)));
-        *p -= rate * m / (v.sqrt() + EPSILON);
+        *p -= rate * m / (v.sqrt() + epsilon);
     }
 }
 
@@ -148,6 +161,9 @@ mod tests {
         let moments = Moments::new(&device, count).unwrap();
         let guard = device.buffer::<u32>("guard", 2).unwrap();
         let mut schedule = Schedule::new(&device, 2).unwrap();
+        // Of the magnitude of the middle gradients.
+        let epsilon = 1e-3;
+        schedule.set_epsilon(1, epsilon);
         let mut reference: Vec<f64> = start.iter().map(|&v| f64::from(v)).collect();
         let mut state = vec![[0.0; 2]; count];
         for step in 1..=20 {
@@ -162,7 +178,8 @@ mod tests {
             for i in 0..count {
                 let rate = rates[usize::from(i % stride >= head)];
                 let range = i..i + 1;
-                adam(&mut reference[range.clone()], &[f64::from(g[i])], &mut state[range], rate, step);
+                let (value, g) = (&mut reference[range.clone()], [f64::from(g[i])]);
+                adam(value, &g, &mut state[range], rate, epsilon, step);
             }
         }
         for (i, (p, t)) in parameters.read().unwrap().into_iter().zip(&reference).enumerate() {

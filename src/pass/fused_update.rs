@@ -126,7 +126,8 @@ pub fn reference(
         for i in 0..values.len() {
             let tail = ROWS[class] == shaders::fused_update::SH_ROW && i % sh_width >= 3;
             let (rate, at) = (rates[class][usize::from(tail)], i..i + 1);
-            adam::adam(&mut values[at.clone()], &gradients[at.clone()], &mut moments[class][at], rate, step);
+            let (value, gradient) = (&mut values[at.clone()], &gradients[at.clone()]);
+            adam::adam(value, gradient, &mut moments[class][at], rate, adam::EPSILON, step);
         }
     }
     let [means, log_scales, quats, opacity_logits, sh] = values;

@@ -149,7 +149,7 @@ pub fn assert_update(device: &Device, scene: &Scene, ways: DeviceChoices) {
         for (i, g) in got.iter().enumerate() {
             let (mut p, mut mv) = ([start[class][i]], [[0.0; 2]]);
             let rate = rates[class][usize::from(i % width >= 3)];
-            adam::adam(&mut p, &[f64::from(*g)], &mut mv, rate, 1);
+            adam::adam(&mut p, &[f64::from(*g)], &mut mv, rate, adam::EPSILON, 1);
             // As in src/pass/adam.rs; v has the rounding of two squares.
             let v = f64::from(now[2 * i + 1]);
             assert!((found[class][i] - p[0]).abs() < 2e-6 + 1e-7 * p[0].abs(), "class {class}, {i}");

@@ -99,7 +99,14 @@ pub fn adam(device: &Device) {
         for i in 0..count {
             let rate = rates[usize::from(i % stride >= head)];
             let range = i..i + 1;
-            optimiser::adam(&mut reference[range.clone()], &[f64::from(g[i])], &mut state[range], rate, step);
+            optimiser::adam(
+                &mut reference[range.clone()],
+                &[f64::from(g[i])],
+                &mut state[range],
+                rate,
+                optimiser::EPSILON,
+                step,
+            );
         }
     }
     for (i, (p, t)) in parameters.read().unwrap().into_iter().zip(&reference).enumerate() {

@@ -163,13 +163,14 @@ pub fn finish(
         },
     );
     let fused = prior::fuse_priors(level, &poses, &inferred, priors, options.seed, progress);
-    let fused = sky.added_to(level, fused);
     progress.step(3, "filling");
-    let complete = fill::fill(level, &poses, &fused, &large, void);
+    let complete = fill::fill(level, &poses, &fused, &large, &no_match);
     let complete = match faces::faces(level, &poses, &fused, &complete, &large, options.seed) {
-        Some(with_faces) => fill::fill(level, &poses, &with_faces, &large, void),
+        Some(with_faces) => fill::fill(level, &poses, &with_faces, &large, &no_match),
         None => complete,
     };
+    // Not before: filling would carry the sky into pixels of the ground that match nowhere.
+    let complete = sky.added_to(level, complete);
     progress.step(4, "points");
     let points = fuse::fuse(level, &poses, &complete, &sky.pixels);
     let mut depths: Vec<DepthMap> =

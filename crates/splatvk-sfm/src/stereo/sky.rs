@@ -18,6 +18,11 @@ const LEAST_SHARE: f32 = 0.02;
 /// Largest density of sparse points in an area, relative to the rest of its photo: nothing stands
 /// in front of the sky, and few points on clouds survive.
 const MOST_POINTS: f64 = 0.1;
+/// Width of the seam around an area, pixels, that belongs to it where its colour does: there, sky
+/// and what stands before it mix.
+const SEAM: usize = 2;
+/// Largest colour distance (L2) of a pixel of the seam from the sky beside it.
+const SEAM_COLOUR: f32 = 0.15;
 /// Confidence of the depth of sky: as if one other view agreed.
 const CONFIDENCE: f32 = 0.6;
 /// Radius of the sphere over the farthest depth that filling accepts in any view.
@@ -127,11 +132,26 @@ fn of_photo(photo: &RgbImage, camera: &Camera, up: DVec3, sparse: &[DVec3]) -> V
             area.iter().for_each(|k| found[*k] = true);
         }
     }
+    for _ in 0..SEAM {
+        widen(&mut found, &reduced);
+    }
     let at = |k: usize| {
         let (x, y) = (k % photo.width / scale, k / photo.width / scale);
         found[y.min(height - 1) * width + x.min(width - 1)]
     };
     (0..photo.data.len()).map(at).collect()
+}
+
+/// Adds the pixels next to sky of nearly its colour.
+fn widen(found: &mut [bool], image: &RgbImage) {
+    let alike = |k: usize, n: usize| {
+        let (a, b) = (image.data[k], image.data[n]);
+        (0..3).map(|c| (a[c] - b[c]).powi(2)).sum::<f32>() < SEAM_COLOUR * SEAM_COLOUR
+    };
+    let joins =
+        |k: &usize| !found[*k] && neighbours(*k, image.width, image.height).any(|n| found[n] && alike(*k, n));
+    let seam: Vec<usize> = (0..found.len()).filter(joins).collect();
+    seam.into_iter().for_each(|k| found[k] = true);
 }
 
 /// Blue, or nearly white.
