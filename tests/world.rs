@@ -72,7 +72,7 @@ fn export_up_turns_scene() {
     let (scene, splats, camera) = tilted_scene(folder.path());
     let export = |scene: &Path, format: &str, axis: &str, name: &str| {
         let mut export = splatvk();
-        export.arg("export").arg(&scene).args(["--format", format, "--up", axis, "--force", "--out"]);
+        export.arg("export").arg(scene).args(["--format", format, "--up", axis, "--force", "--out"]);
         export.arg(folder.path().join(name));
         export
     };

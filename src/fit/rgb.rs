@@ -250,8 +250,7 @@ impl<'a> Run<'a> {
             let losses = (&Losses::VIRTUAL, options.min_confidence);
             views.add(device, virtual_views.photos(), losses, start.len(), 0)?;
         }
-        let mut model = Model::new(device, start, 0)?;
-        model.hold_colours_below(options.colour_pixels, photos.images.first().map_or(1, |i| i.data.len()));
+        let model = Model::new(device, start, 0)?;
         let order = ViewOrder::new(photos.cameras.len(), virtual_views.cameras.len(), options.seed);
         let cameras = [first.cameras, &virtual_views.cameras].concat();
         let trainer = Trainer::new(device, raster, model, views, cameras, order);
@@ -410,6 +409,8 @@ impl Training for Run<'_> {
         if iteration >= half_res_steps(self.options) {
             self.leave_half_res()?;
         }
+        let size = self.photos.images.first().map_or(1, |i| i.data.len());
+        self.trainer.model.hold_colours_below(self.options.colour_pixels, size);
         self.trainer.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)
     }
 
