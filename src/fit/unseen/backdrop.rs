@@ -107,3 +107,65 @@ fn colour_towards(direction: DVec3, samples: &[Sample]) -> Option<([f32; 3], f64
     }
     (total > 0.0).then(|| (sum.map(|v| (v / total) as f32), angle))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Camera, DepthMap, Image, Pose, RgbImage};
+
+    const WIDTH: usize = 80;
+    const HEIGHT: usize = 60;
+
+    /// 53° across, at the origin, looking along z.
+    fn camera() -> Camera {
+        let (width, height) = (WIDTH as u32, HEIGHT as u32);
+        Camera {
+            name: "a".into(),
+            width,
+            height,
+            fx: 80.0,
+            fy: 80.0,
+            cx: 40.0,
+            cy: 30.0,
+            pose: Pose::IDENTITY,
+        }
+    }
+
+    #[test]
+    fn far_colours_continue_behind_near_ones_and_fade() {
+        // A blue wall, a red thing of 8 × 8 pixels before its middle.
+        let near = |i: usize| (36..44).contains(&(i % WIDTH)) && (26..34).contains(&(i / WIDTH));
+        let of =
+            |near_value: f32, far_value: f32| move |i: usize| if near(i) { near_value } else { far_value };
+        let data = (0..WIDTH * HEIGHT).map(|i| [of(0.9, 0.1)(i), 0.2, of(0.1, 0.8)(i)]).collect();
+        let depth: Vec<f32> = (0..WIDTH * HEIGHT).map(of(1.0, 5.0)).collect();
+        let points: Vec<[f32; 3]> = (0..1000).map(|k| [0.003 * k as f32 - 1.5, 0.0, 5.0]).collect();
+        let photos = Photos {
+            images: &[RgbImage { width: WIDTH, height: HEIGHT, data }],
+            cameras: &[camera()],
+            depths: Some(&[DepthMap {
+                depth: Image { width: WIDTH, height: HEIGHT, data: depth },
+                confidence: Image::filled(WIDTH, HEIGHT, 1.0),
+            }]),
+            coverage: &[],
+        };
+        let splats = backdrop(&photos, &points);
+        let mut least = [1.0f32; 2];
+        for i in 0..splats.len() {
+            let mean = DVec3::from(splats.means[i].map(f64::from));
+            assert!(mean.length() > 5.0, "behind all points");
+            let colour = [0, 1, 2].map(|c| 0.5 + SH_C0 * splats.sh[3 * i + c]);
+            let angle = mean.normalize().angle_between(DVec3::Z);
+            if angle < 0.1 {
+                assert!(colour[2] > 0.7 && colour[0] < 0.2, "the wall behind the thing: {colour:?}");
+            }
+            // The nearest border is 20.6° from the middle, the farthest 32°.
+            assert!(angle < 32f64.to_radians() + FADES[1], "{angle}");
+            let opacity = 1.0 / (1.0 + (-splats.opacity_logits[i]).exp());
+            let at = usize::from(angle > 20f64.to_radians());
+            least[at] = least[at].min(opacity);
+        }
+        assert!(splats.len() > 800 && least[0] > 0.97 && least[1] < 0.1, "{} {least:?}", splats.len());
+        assert!(backdrop(&Photos { depths: None, ..photos }, &points).is_empty());
+    }
+}

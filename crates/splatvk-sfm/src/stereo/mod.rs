@@ -149,6 +149,9 @@ pub fn finish(
 ) -> (Vec<DepthMap>, PointCloud) {
     progress.begin("surfaces", SURFACE_STEPS);
     let PhotoSegments { void, sky, weak, areas } = segments;
+    if let Some(note) = sky.note(level) {
+        progress.inform(&note);
+    }
     let poses = surface::RelativePoses::new(level);
     let no_match: Vec<bool> = void.iter().zip(&sky.pixels).map(|(void, sky)| *void || *sky).collect();
     let consistent = surface::consistent_surface(level, &poses, matched, &no_match, weak);

@@ -57,6 +57,21 @@ impl Sky {
         Sky { pixels, centre, radius: RADIUS * farthest }
     }
 
+    /// States where sky was found, since a wall taken for sky would lie far behind its place.
+    pub fn note(&self, level: &Level) -> Option<String> {
+        let views = level.references.iter().zip(&level.cameras);
+        let with_sky: Vec<&str> = views
+            .filter(|(r, _)| {
+                let own = r.first as usize..(r.first + r.width * r.height) as usize;
+                self.pixels[own].contains(&true)
+            })
+            .map(|(_, camera)| camera.name.as_str())
+            .collect();
+        let count = format!("sky in {} of {} photos", with_sky.len(), level.cameras.len());
+        (!with_sky.is_empty())
+            .then(|| format!("{count}, placed far behind the scene: {}", with_sky.join(", ")))
+    }
+
     /// The surface with the sky's pixels on the sphere.
     pub fn added_to(&self, level: &Level, mut surface: Surface) -> Surface {
         for (view, camera) in level.cameras.iter().enumerate() {
