@@ -72,7 +72,15 @@ fn export_up_turns_scene() {
     let (scene, splats, camera) = tilted_scene(folder.path());
     let export = |scene: &Path, format: &str, axis: &str, name: &str| {
         let mut export = splatvk();
-        export.arg("export").arg(scene).args(["--format", format, "--up", axis, "--force", "--out"]);
+        export.arg("export").arg(scene).args([
+            "--format",
+            format,
+            "--up",
+            axis,
+            "--guessed",
+            "--force",
+            "--out",
+        ]);
         export.arg(folder.path().join(name));
         export
     };
@@ -139,7 +147,7 @@ fn measure_scale_sets_metres() {
         export
             .arg("export")
             .arg(&scene)
-            .args(["--format", "ply", "--metres", "--out"])
+            .args(["--format", "ply", "--metres", "--guessed", "--out"])
             .arg(folder.path().join(name));
         export
     };
