@@ -351,13 +351,17 @@ def language():
     side = np.load(str(out) + ".language.npz")
     features = np.load(SCENE / "language/features.npz")
     whole, packed = read_ply(SCENE / "point_cloud.ply"), of_gsply(gsply.plyread(str(out)))
+    # What no photo shows is left out.
+    seen = np.load(SCENE / "seen.npy") >= 0.05
+    whole = {"means": whole["means"][seen]}
     span = np.ptp(whole["means"], axis=0).max() / 2046
+
     def carried(arrays, level):
         return np.stack([arrays[f"{kind}_{level}"] for kind in ("first", "second", "share", "reliability")], axis=1)
 
     for level in (name[-1] for name in features.files if name.startswith("first_")):
         # What only one splat carries tells where that splat went; its position must have gone there, too.
-        ours = carried(features, level)
+        ours = carried(features, level)[seen]
         unique, first, count = np.unique(ours, axis=0, return_index=True, return_counts=True)
         where = {f.tobytes(): i for f, i, n in zip(unique, first, count) if n == 1}
         known = {f.tobytes() for f in unique}
