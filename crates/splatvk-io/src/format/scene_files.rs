@@ -46,10 +46,11 @@ impl Names {
             "language",
             "previews",
         ];
-        const FILES: [&str; 10] = [
+        const FILES: [&str; 11] = [
             scene_dir::MANIFEST,
             scene_dir::SPLATS,
             scene_dir::SEEN,
+            scene_dir::BACKDROP,
             "run.json",
             "report.html",
             "cameras/transforms.json",

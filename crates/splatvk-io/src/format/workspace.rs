@@ -139,7 +139,7 @@ mod tests {
         let contents = Contents {
             splats: &splats,
             seen: &crate::scene::Seen::default(),
-            backdrop: &Default::default(),
+            backdrop: &splats,
             cameras: std::slice::from_ref(&camera),
             world: &Default::default(),
             photos: &[],
