@@ -37,7 +37,7 @@ const LEAST_OPACITY: f64 = 0.02;
 struct UnseenSplat {
     /// Distance from the end of the surface, pixels.
     distance: f64,
-    /// The same over the reach.
+    /// [`Self::distance`] over the reach.
     share: f64,
     position: DVec3,
     /// World steps of one grid cell along x and y.

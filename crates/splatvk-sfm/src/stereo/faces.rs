@@ -275,13 +275,11 @@ fn along_axis([a, b]: [(Vec3, f32); 2], axis: Vec3) -> Option<Vec3> {
 #[cfg(test)]
 mod tests {
     use super::super::surface::map_pixels;
+    use super::super::tests::{HEIGHT, WIDTH, camera_at, pixel_centre};
     use super::super::{StereoOptions, fill, planes, pyramid};
     use super::*;
-    use crate::scene::{Camera, Pose, RgbImage};
+    use crate::scene::{Camera, RgbImage};
     use glam::{DVec2, DVec3};
-
-    const WIDTH: usize = 160;
-    const HEIGHT: usize = 120;
 
     /// Front of a box, its left side, or the wall behind, at the end of a ray; with its colour.
     fn hit(camera: &Camera, pixel: DVec2) -> (DVec3, [f32; 3]) {
@@ -298,38 +296,21 @@ mod tests {
         (wall, [0.2, 0.6, 0.5 + 0.2 * (5.0 * wall.x).sin() as f32])
     }
 
-    fn camera(x: f64) -> Camera {
-        Camera {
-            name: x.to_string(),
-            width: WIDTH as u32,
-            height: HEIGHT as u32,
-            fx: 110.0,
-            fy: 110.0,
-            cx: 80.0,
-            cy: 60.0,
-            pose: Pose { translation: DVec3::new(-x, 0.0, 0.0), ..Pose::IDENTITY },
-        }
-    }
-
-    fn pixel(k: usize) -> DVec2 {
-        DVec2::new((k % WIDTH) as f64 + 0.5, (k / WIDTH) as f64 + 0.5)
-    }
-
     #[test]
     fn side_of_box_gets_its_plane() {
         // The first camera alone stands to the left of the box.
-        let cameras = [camera(-0.9), camera(0.0), camera(0.4)];
+        let cameras = [camera_at(-0.9), camera_at(0.0), camera_at(0.4)];
         let images = cameras.each_ref().map(|c| RgbImage {
             width: WIDTH,
             height: HEIGHT,
-            data: (0..WIDTH * HEIGHT).map(|k| hit(c, pixel(k)).1).collect(),
+            data: (0..WIDTH * HEIGHT).map(|k| hit(c, pixel_centre(k)).1).collect(),
         });
         let sparse: Vec<DVec3> =
-            (0..WIDTH * HEIGHT).step_by(97).map(|k| hit(&cameras[0], pixel(k)).0).collect();
+            (0..WIDTH * HEIGHT).step_by(97).map(|k| hit(&cameras[0], pixel_centre(k)).0).collect();
         let options = StereoOptions { rounds: vec![1], ..StereoOptions::default() };
         let level = pyramid(&images, &cameras, &sparse, &options).unwrap().pop().unwrap();
         let poses = RelativePoses::new(&level);
-        let at = |view: usize, x: usize, y: usize| hit(&cameras[view], pixel(y * WIDTH + x)).0;
+        let at = |view: usize, x: usize, y: usize| hit(&cameras[view], pixel_centre(y * WIDTH + x)).0;
         // All views match the front and the wall where another one shows them, too.
         let planes = map_pixels(&level, |view, x, y, _| Vec3::Z / at(view, x, y).z as f32);
         let shown = |point: DVec3, other: usize| {
@@ -350,11 +331,11 @@ mod tests {
         let with_faces = faces(&level, &poses, &known, &complete, &large, 1).unwrap();
         let after = fill::fill(&level, &poses, &with_faces, &large, &void);
         let side: Vec<usize> =
-            (0..WIDTH * HEIGHT).filter(|k| is_side(hit(&cameras[0], pixel(*k)).0)).collect();
+            (0..WIDTH * HEIGHT).filter(|k| is_side(hit(&cameras[0], pixel_centre(*k)).0)).collect();
         let wrong = |surface: &Surface| {
             let error = |k: &usize| {
                 let found = surface.planes[*k].dot(ray(&level, 0, k % WIDTH, k / WIDTH));
-                (f64::from(found) * hit(&cameras[0], pixel(*k)).0.z - 1.0).abs()
+                (f64::from(found) * hit(&cameras[0], pixel_centre(*k)).0.z - 1.0).abs()
             };
             side.iter().filter(|k| error(k) > 0.03).count()
         };

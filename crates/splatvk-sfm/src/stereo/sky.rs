@@ -209,28 +209,17 @@ fn connected(start: usize, candidate: &[bool], width: usize, height: usize, done
 
 #[cfg(test)]
 mod tests {
+    use super::super::tests::{HEIGHT, WIDTH, camera_at, pixel_centre};
     use super::super::{StereoOptions, pyramid};
     use super::*;
     use crate::math::Random;
-    use crate::scene::Pose;
 
-    const WIDTH: usize = 160;
-    const HEIGHT: usize = 120;
     /// First row below the sky.
     const ROOFS: usize = 40;
 
     /// Two cameras side by side.
     fn cameras() -> [Camera; 2] {
-        [0.0, 0.5].map(|x| Camera {
-            name: x.to_string(),
-            width: WIDTH as u32,
-            height: HEIGHT as u32,
-            fx: 110.0,
-            fy: 110.0,
-            cx: 80.0,
-            cy: 60.0,
-            pose: Pose { translation: DVec3::new(-x, 0.0, 0.0), ..Pose::IDENTITY },
-        })
+        [0.0, 0.5].map(camera_at)
     }
 
     /// Number of sky pixels of the first view in the upper part and below. The upper part has one
@@ -293,8 +282,7 @@ mod tests {
             for k in (0..ROOFS * WIDTH / 2).step_by(101) {
                 let index = level.references[view].first as usize + k;
                 let inverse = surface.planes[index].dot(ray(&level, view, k % WIDTH, k / WIDTH));
-                let pixel = DVec2::new((k % WIDTH) as f64 + 0.5, (k / WIDTH) as f64 + 0.5);
-                let point = camera.unproject(pixel, 1.0 / f64::from(inverse));
+                let point = camera.unproject(pixel_centre(k), 1.0 / f64::from(inverse));
                 assert!((point.distance(centre) / sky.radius - 1.0).abs() < 1e-3, "{view} {k}");
                 assert!(surface.confidence[index] > 0.5);
             }

@@ -3,6 +3,29 @@ use crate::scene::Pose;
 use glam::{DMat3, DVec2};
 use splatvk_test_support::stereo::synthetic;
 
+/// Size of the photos of [`camera_at`].
+pub(super) const WIDTH: usize = 160;
+pub(super) const HEIGHT: usize = 120;
+
+/// A camera that looks along z, 72° across, moved to the right by `x`.
+pub(super) fn camera_at(x: f64) -> Camera {
+    Camera {
+        name: x.to_string(),
+        width: WIDTH as u32,
+        height: HEIGHT as u32,
+        fx: 110.0,
+        fy: 110.0,
+        cx: 80.0,
+        cy: 60.0,
+        pose: Pose { translation: DVec3::new(-x, 0.0, 0.0), ..Pose::IDENTITY },
+    }
+}
+
+/// Centre of a pixel of these photos.
+pub(super) fn pixel_centre(k: usize) -> DVec2 {
+    DVec2::new((k % WIDTH) as f64 + 0.5, (k / WIDTH) as f64 + 0.5)
+}
+
 #[test]
 fn pyramid_chooses_sources_at_best_angles() {
     // Seven cameras around the points at steps of 10°.
