@@ -3,7 +3,7 @@ use crate::gpu::{Options, TestDevice, options, test_device};
 use crate::math::hash;
 use crate::pass::plane_sweep::{DevicePlaneSweep, GpuMatcher, Matcher, ReferenceView};
 use crate::pass::plane_sweep_cpu::CpuMatcher;
-use crate::pose::stereo::{StereoOptions, dense, pyramid, run_schedule};
+use crate::pose::stereo::{Dense, StereoOptions, dense, pyramid, run_schedule};
 use crate::progress::Silent;
 use glam::{DVec3, Vec4};
 use splatvk_test_support::stereo::{breakfast, errors, synthetic, synthetic_from, within};
@@ -88,7 +88,7 @@ fn slanted_planes_are_recovered_reproducibly() {
         )
         .unwrap()
     };
-    let (depths, points) = run();
+    let Dense { depths, points, .. } = run();
     for (found, exact) in depths.iter().zip(&set.depth) {
         let (e, complete) = errors(&found.depth, exact);
         // Measured: median 0.05 %, 97 % within 1 %, complete; the rest is the square's rim.
@@ -103,7 +103,8 @@ fn slanted_planes_are_recovered_reproducibly() {
         assert!((points.radius[k] as f64 * camera.fx / z - 1.0).abs() < 1e-3, "radius is z / f");
         assert!(points.confidence[k] > 0.0);
     }
-    assert!(run() == (depths, points), "same input and seed, different output");
+    let again = run();
+    assert!(again.depths == depths && again.points == points, "same input and seed, different output");
 }
 
 /// Little parallax and sensor noise: 1.5 px of mismatch are 3 % of the depth, and the noise is a
@@ -120,7 +121,7 @@ fn noisy_photos_with_little_parallax_match() {
             *c = c.map(|v| (0.3 + 0.08 * v + 0.02 * noise).clamp(0.0, 1.0));
         }
     }
-    let (depths, _) = dense(
+    let Dense { depths, .. } = dense(
         &DevicePlaneSweep::new(&device),
         &set.images,
         &[],
@@ -152,7 +153,7 @@ fn white_frames_get_no_depth() {
         }
     }
     let options = StereoOptions { planes: 16, coarse_rounds: 2, rounds: vec![2], ..StereoOptions::default() };
-    let (depths, _) = dense(
+    let Dense { depths, .. } = dense(
         &DevicePlaneSweep::new(&device),
         &set.images,
         &[],
@@ -180,7 +181,7 @@ fn photos_of_different_sizes_are_matched() {
     set.images[0] = small.images[0].clone();
     set.cameras[0] = small.cameras[0].clone();
     set.depth[0] = small.depth[0].clone();
-    let (depths, _) = dense(
+    let Dense { depths, .. } = dense(
         &DevicePlaneSweep::new(&device),
         &set.images,
         &[],
@@ -202,7 +203,7 @@ fn photos_of_different_sizes_are_matched() {
 fn breakfast_depth_at_quarter_resolution() {
     let device = test_device();
     let set = breakfast(4);
-    let (depths, points) = dense(
+    let Dense { depths, points, .. } = dense(
         &DevicePlaneSweep::new(&device),
         &set.images,
         &[],

@@ -25,6 +25,7 @@ pub(super) fn geometry(
         depths: Vec::new(),
         focal_log_sigma: None,
         fitted: Vec::new(),
+        sky: Vec::new(),
         method: "cameras+points".into(),
     })
 }

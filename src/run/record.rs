@@ -52,6 +52,8 @@ pub struct GeometryRecord {
     pub focal_px: Vec<f64>,
     /// One standard deviation of ln f, where it was estimated.
     pub focal_log_sigma: Option<f64>,
+    /// Share of each photo that was taken for sky; empty where none was looked for.
+    pub sky: Vec<f32>,
     /// One entry per photo with estimated intrinsics.
     pub optics: Vec<IntrinsicsRecord>,
 }
@@ -168,6 +170,7 @@ fn statistics(o: &RunOutcome) -> Statistics {
         points: o.geometry.points.len(),
         focal_px: o.cameras.iter().map(|c| c.fx).collect(),
         focal_log_sigma: o.geometry.focal_log_sigma,
+        sky: o.geometry.sky.clone(),
         optics: intrinsics(o),
     };
     let other = match other {

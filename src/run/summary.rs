@@ -121,6 +121,7 @@ fn figures(o: &RunOutcome) -> Vec<Figure> {
             "What the scene is divided into. A click selects one; a thing may still be several that touch.";
         list.push(Figure::that_matters("things", text, meaning));
     }
+    list.extend(sky_figure(&o.photos, &o.geometry.sky));
     list.push(up_figure(&o.world));
     list.push(splats_figure(&o.splats, &o.seen));
     list.extend(view_dependence_figure(&o.rgb.view_dependence));
@@ -142,6 +143,15 @@ fn closing_lines(o: &RunOutcome) -> Vec<(String, String)> {
     let answers = o.language.iter().flat_map(|l| &l.answers);
     let answers = answers.map(|a| (format!("“{}”", report::one_line(&a.text)), a.verdict()));
     device.chain(figures).chain(answers).collect()
+}
+
+/// Photos in which sky was found: a wall taken for sky lies too far away.
+fn sky_figure(photos: &[Photo], shares: &[f32]) -> Option<Figure> {
+    let with_sky: Vec<&str> =
+        photos.iter().zip(shares).filter(|(_, share)| **share > 0.0).map(|(p, _)| p.stem.as_str()).collect();
+    let meaning = "Bright, even areas at the top of photos are placed far behind the scene. A wall among them lies too far away.";
+    let text = format!("in {} of {} photos: {}", with_sky.len(), photos.len(), with_sky.join(", "));
+    (!with_sky.is_empty()).then(|| Figure::that_matters("sky", text, meaning))
 }
 
 /// Number of splats, and how many of them are extrapolated.

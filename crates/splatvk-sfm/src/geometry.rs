@@ -17,6 +17,9 @@ pub struct Geometry {
     pub focal_log_sigma: Option<f64>,
     /// Estimated intrinsics and fit quality, one per photo, if they were estimated.
     pub fitted: Vec<Fitted>,
+    /// Share of each photo that was taken for sky; empty where none was looked for.
+    #[serde(default)]
+    pub sky: Vec<f32>,
     /// Name of the initialiser and of its inputs, for run.json.
     pub method: String,
 }

@@ -4,7 +4,7 @@ use super::confidence::{DOUBTFUL, DOUBTFUL_ROTATION, UNSURE_FOCAL};
 use super::leave_out::{self, Placed};
 use super::matching::Detect;
 use super::sharpness::warn_of_blur;
-use super::stereo::{self, PlaneSweep, StereoOptions};
+use super::stereo::{self, Dense, PlaneSweep, StereoOptions};
 use super::{Geometry, Keypoints, SparseModel, given, light, sfm, still};
 use crate::Result;
 use crate::photo::Photo;
@@ -121,10 +121,10 @@ pub fn dense(
     let images: Vec<_> = photos.iter().map(|p| p.image.clone()).collect();
     let coverage: Vec<_> = photos.iter().map(|p| p.coverage.clone()).collect();
     let positions: Vec<_> = model.points.iter().map(|p| p.position).collect();
-    let (depths, points) =
+    let Dense { depths, points, sky } =
         stereo::dense(sweep, &images, &coverage, &model.cameras, &positions, priors, options, progress)?;
     let SparseModel { cameras, focal_log_sigma, fitted, .. } = model;
-    Ok(Geometry { cameras, depths, points, focal_log_sigma, fitted, method })
+    Ok(Geometry { cameras, depths, points, focal_log_sigma, fitted, sky, method })
 }
 
 /// Least residual of a photo that does not fit the model, as a multiple of the median of the

@@ -112,8 +112,10 @@ impl Stage for AddedDepth {
         )?;
 
         let mut depths: Vec<DepthMap> = rendered.iter().map(trusted).collect();
-        for (view, depth) in views.iter().zip(dense.depths) {
+        let mut sky = vec![0.0; all];
+        for ((view, depth), share) in views.iter().zip(dense.depths).zip(dense.sky) {
             depths[*view] = depth;
+            sky[*view] = share;
         }
         let new: Vec<_> = (count..all).map(|v| (&model.cameras[v], &depths[v], &rendered[v])).collect();
         let mut points = fit::new_surface(&dense.points, &new);
@@ -124,6 +126,7 @@ impl Stage for AddedDepth {
             depths,
             focal_log_sigma: model.focal_log_sigma,
             fitted: model.fitted.clone(),
+            sky,
             method: method.clone(),
         })
     }
@@ -248,6 +251,7 @@ impl Stage for OnlyAddedGeometry {
         Ok(Geometry {
             cameras: geometry.cameras[self.known..].to_vec(),
             depths: geometry.depths[self.known..].to_vec(),
+            sky: geometry.sky[self.known..].to_vec(),
             ..geometry.clone()
         })
     }

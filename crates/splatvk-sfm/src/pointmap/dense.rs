@@ -42,6 +42,7 @@ pub(super) fn output(maps: &Pointmaps, canonical: &[Canonical], a: &Adjustment) 
         points: fuse(views, &layers),
         focal_log_sigma: Some(a.focal_log_sigma),
         fitted: Vec::new(),
+        sky: Vec::new(),
         method: "pointmap".into(),
     }
 }

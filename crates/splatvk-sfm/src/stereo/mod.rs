@@ -27,6 +27,17 @@ use crate::scene::{Camera, Coverage, DepthMap, DepthPrior, Image, PointCloud, Rg
 use glam::{DVec3, Vec4};
 use rayon::prelude::*;
 
+/// Result of dense stereo.
+#[derive(Clone, Debug, Default)]
+pub struct Dense {
+    /// One per photo, at its size. Complete except at white borders and unused pixels.
+    pub depths: Vec<DepthMap>,
+    /// Fused points.
+    pub points: PointCloud,
+    /// Share of the pixels of each photo that was taken for sky and lies far behind everything.
+    pub sky: Vec<f32>,
+}
+
 /// Depth maps and fused points of photos with `cameras` at their working resolutions. Depth is
 /// complete except at white borders and unused pixels. `sparse` are points of the scene in world
 /// coordinates: they set the range of depth and choose the source views. `sweep` computes the
@@ -42,7 +53,7 @@ pub fn dense(
     priors: &[Option<DepthPrior>],
     options: &StereoOptions,
     progress: &dyn Progress,
-) -> Result<(Vec<DepthMap>, PointCloud)> {
+) -> Result<Dense> {
     let options = &StereoOptions { binding: sweep.binding(), ..options.clone() };
     let levels = pyramid(images, cameras, sparse, options)?;
     let finest = &levels[levels.len() - 1];
@@ -146,12 +157,9 @@ pub fn finish(
     priors: &[Option<DepthPrior>],
     options: &StereoOptions,
     progress: &dyn Progress,
-) -> (Vec<DepthMap>, PointCloud) {
+) -> Dense {
     progress.begin("surfaces", SURFACE_STEPS);
     let PhotoSegments { void, sky, weak, areas } = segments;
-    if let Some(note) = sky.note(level) {
-        progress.inform(&note);
-    }
     let poses = surface::RelativePoses::new(level);
     let no_match: Vec<bool> = void.iter().zip(&sky.pixels).map(|(void, sky)| *void || *sky).collect();
     let consistent = surface::consistent_surface(level, &poses, matched, &no_match, weak);
@@ -183,7 +191,7 @@ pub fn finish(
     }
     progress.step(SURFACE_STEPS, "");
     progress.end();
-    (depths, points)
+    Dense { depths, points, sky: sky.shares(level) }
 }
 
 /// Steps of the progress bar: consistency, planes, regions, filling, points.

@@ -1,9 +1,9 @@
 //! Sky: it has no texture and no parallax, so matching and filling put it on roofs and hills.
 //! It gets a surface of its own, a sphere far behind all that is matched
 //! (docs/internals/method.md#sky).
-use super::Level;
 use super::surface::{Surface, neighbours, ray};
 use super::views::{halved, in_image};
+use super::{Level, ReferenceView};
 use crate::scene::{Camera, CameraOrbit, RgbImage};
 use glam::{DVec2, DVec3, Vec3};
 
@@ -57,19 +57,13 @@ impl Sky {
         Sky { pixels, centre, radius: RADIUS * farthest }
     }
 
-    /// States where sky was found, since a wall taken for sky would lie far behind its place.
-    pub fn note(&self, level: &Level) -> Option<String> {
-        let views = level.references.iter().zip(&level.cameras);
-        let with_sky: Vec<&str> = views
-            .filter(|(r, _)| {
-                let own = r.first as usize..(r.first + r.width * r.height) as usize;
-                self.pixels[own].contains(&true)
-            })
-            .map(|(_, camera)| camera.name.as_str())
-            .collect();
-        let count = format!("sky in {} of {} photos", with_sky.len(), level.cameras.len());
-        (!with_sky.is_empty())
-            .then(|| format!("{count}, placed far behind the scene: {}", with_sky.join(", ")))
+    /// Share of sky per view.
+    pub fn shares(&self, level: &Level) -> Vec<f32> {
+        let share = |r: &ReferenceView| {
+            let own = &self.pixels[r.first as usize..(r.first + r.width * r.height) as usize];
+            own.iter().filter(|sky| **sky).count() as f32 / own.len().max(1) as f32
+        };
+        level.references.iter().map(share).collect()
     }
 
     /// The surface with the sky's pixels on the sphere.
