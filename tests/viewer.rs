@@ -5,6 +5,7 @@ mod browser;
 mod fixture;
 
 use browser::Page;
+use browser::pictures::{coloured, inner_point, iou, keep_screenshot, object_mask, page_position, to_float};
 use fixture::view::{LABELS, Server, breakfast, masks_of};
 use fixture::{data, truth};
 use serde_json::{Value, json};
@@ -20,48 +21,6 @@ use splatvk::run::sources;
 use splatvk::run::view::Viewer;
 use splatvk::scene::{Image, LanguageField, RgbImage, Seen};
 use std::path::{Path, PathBuf};
-
-fn to_float(picture: &image::RgbImage) -> RgbImage {
-    let data = picture.pixels().map(|p| p.0.map(|v| f32::from(v) / 255.0)).collect();
-    RgbImage { width: picture.width() as usize, height: picture.height() as usize, data }
-}
-
-/// The point of the object's mask farthest from its edge, in pixels of the photo.
-fn inner_point(mask: &Image<i32>, object: i32) -> (f64, f64) {
-    let mut best = (0, 0, 0);
-    for y in 0..mask.height {
-        for x in 0..mask.width {
-            while is_clear(mask, object, x, y, best.2 + 1) {
-                best = (x, y, best.2 + 1);
-            }
-        }
-    }
-    (best.0 as f64 + 0.5, best.1 as f64 + 0.5)
-}
-
-/// Whether a square of radius `r` lies inside the object.
-fn is_clear(mask: &Image<i32>, object: i32, x: usize, y: usize, r: usize) -> bool {
-    x >= r
-        && y >= r
-        && x + r < mask.width
-        && y + r < mask.height
-        && (y - r..=y + r).all(|j| (x - r..=x + r).all(|i| mask.at(i, j) == object))
-}
-
-/// Pixels that a relevancy picture colours; the others are grey.
-fn coloured(picture: &image::RgbImage) -> Vec<bool> {
-    // Warm and light colours of the heat map differ by more than half the range between channels.
-    picture.pixels().map(|p| p.0.iter().max().unwrap() - p.0.iter().min().unwrap() > 100).collect()
-}
-
-fn iou(a: &[bool], b: &[bool]) -> f64 {
-    let both = a.iter().zip(b).filter(|(a, b)| **a && **b).count();
-    both as f64 / a.iter().zip(b).filter(|(a, b)| **a || **b).count() as f64
-}
-
-fn object_mask(mask: &Image<i32>, object: i32) -> Vec<bool> {
-    mask.data.iter().map(|l| *l == object).collect()
-}
 
 #[test]
 fn served_view_draws_and_answers() {
@@ -95,12 +54,6 @@ fn served_view_draws_and_answers() {
 }
 
 /// Keeps a screenshot for inspection if `SPLATVK_KEEP` names a folder.
-fn keep_screenshot(page: &mut Page, name: &str) {
-    if let Ok(folder) = std::env::var("SPLATVK_KEEP") {
-        std::fs::write(Path::new(&folder).join(name), page.screenshot()).unwrap();
-    }
-}
-
 fn check_drawing(page: &mut Page, scene: &Path) {
     let loaded = scene_dir::load(scene).unwrap();
     let device = gpu::open(None).unwrap();
@@ -120,14 +73,6 @@ fn check_drawing(page: &mut Page, scene: &Path) {
     // have the same shapes in other shades.
     assert!(psnr(&depth, &engine) > 15.0, "{}", psnr(&depth, &engine));
     page.run("splatvk.show('colour')");
-}
-
-/// Position of a pixel of photo 0 on a page whose canvas fills the window.
-fn page_position(page: &mut Page, (x, y): (f64, f64)) -> (f64, f64) {
-    let size = page.run("[innerWidth, innerHeight]");
-    let (width, height) = (size[0].as_f64().unwrap(), size[1].as_f64().unwrap());
-    let scale = (width / 640.0).min(height / 480.0);
-    (width / 2.0 + (x - 320.0) * scale, height / 2.0 + (y - 240.0) * scale)
 }
 
 fn check_selection(page: &mut Page) {
@@ -465,60 +410,4 @@ fn training_report_shows_scene() {
         0
     );
     keep_screenshot(&mut page, "report.png");
-}
-
-/// The pictures of the README, from a real run: `SPLATVK_SCENE=out/breakfast cargo test --test
-/// viewer -- --ignored`.
-#[test]
-#[ignore = "needs a scene of splatvk run on breakfast in SPLATVK_SCENE"]
-fn pictures_of_a_real_scene() {
-    let scene = PathBuf::from(std::env::var("SPLATVK_SCENE").unwrap());
-    let chromium = browser::installed().unwrap();
-    let server = Server::start(&scene);
-    let mut page = Page::open(&chromium, 1120, 760, false);
-    page.go(&server.address);
-    let loaded = scene_dir::load(&scene).unwrap();
-    let device = gpu::open(None).unwrap();
-    let mut viewer = Viewer::new(&device, &loaded.splats, &LanguageField::default()).unwrap();
-    let engine = viewer.view(&loaded.cameras[0]).unwrap().rendered.rgb;
-    let likeness = psnr(&to_float(&page.picture(0)), &engine);
-    println!("{likeness:.1} dB against splatvk render, {} splats", loaded.splats.len());
-    assert!(likeness > 25.0);
-    let masks = masks_of("train_00");
-    page.run("splatvk.goTo(0)");
-    for (object, word) in [(7, "lemon"), (9, "mug"), (4, "cereal"), (8, "loaf")] {
-        let (x, y) = page_position(&mut page, inner_point(&masks, object));
-        page.click(x, y);
-        let names = page.run(
-            "[...document.querySelectorAll('.v-names li')].map((l) => l.firstChild.textContent).join(', ') \
-             || document.querySelector('.v-doubt').textContent",
-        );
-        println!("a click on {word}: {} = {names}", page.run("splatvk.state.selected"));
-    }
-    let (x, y) = page_position(&mut page, inner_point(&masks, 9));
-    page.click(x, y);
-    let shots = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/images");
-    let save_picture = |page: &mut Page, name: &str, width: u32| {
-        let shot = image::load_from_memory(&page.screenshot()).unwrap().to_rgb8();
-        let height = shot.height() * width / shot.width();
-        let small = image::imageops::resize(&shot, width, height, image::imageops::FilterType::Lanczos3);
-        let file = std::fs::File::create(shots.join(name)).unwrap();
-        image::codecs::jpeg::JpegEncoder::new_with_quality(file, 85).encode_image(&small).unwrap();
-    };
-    save_picture(&mut page, "view-select.jpg", 840);
-    for (text, object) in [("lemon", 7), ("blue mug", 9), ("box of cereal", 4), ("loaf of bread", 8)] {
-        page.run(&format!("splatvk.ask('{text}')"));
-        let overlap = iou(&coloured(&page.picture(0)), &object_mask(&masks, object));
-        println!("{text}: IoU {overlap:.2} in photo 0");
-        page.run("splatvk.settled()");
-    }
-    page.run("splatvk.ask('blue mug')");
-    save_picture(&mut page, "view-query.jpg", 840);
-    drop(page);
-    let mut phone = Page::open(&chromium, 390, 844, true);
-    phone.go(&server.address);
-    phone.run("splatvk.ask('lemon')");
-    save_picture(&mut phone, "view-phone.jpg", 390);
-    phone.run("splatvk.show('level', 2)");
-    keep_screenshot(&mut phone, "phone-level.png");
 }

@@ -4,7 +4,7 @@ use super::bounds::Bounds;
 use super::half_res::Photos;
 use super::init::splats_from_points;
 use super::options::RgbOptions;
-use super::rgb::{Trained, fit_photos};
+use super::rgb::{Trained, fit_with_unseen};
 use super::scale::SceneScale;
 use super::unseen::continued_surfaces;
 use crate::Result;
@@ -57,12 +57,14 @@ pub(crate) fn train_on(
     }
     let surfaces = start.means.clone();
     let cameras = photos.cameras;
-    start.append_raised(continued_surfaces(&photos, options));
+    let mut unseen = continued_surfaces(&photos, options);
     if options.bounded {
-        start = Bounds::new(cameras, &surfaces).clamp_to_bounds(start);
+        let bounds = Bounds::new(cameras, &surfaces);
+        (start, unseen) = (bounds.clamp_to_bounds(start), bounds.clamp_to_bounds(unseen));
     }
     let scale = SceneScale::measure(cameras, &surfaces);
-    Ok(fit_photos(device, photos, start, scale, options, progress)?.with_backdrop(&photos, options))
+    let trained = fit_with_unseen(device, photos, start, unseen, scale, options, progress)?;
+    Ok(trained.with_backdrop(&photos, options))
 }
 
 #[cfg(test)]

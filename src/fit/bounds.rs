@@ -47,9 +47,10 @@ impl Bounds {
         (LARGEST * distances.fold(f64::INFINITY, f64::min)).max(1e-12).ln() as f32
     }
 
-    /// Shortens the scales of one splat; returns whether any was too large.
-    fn shorten(&self, mean: &[f32; 3], log_scales: &mut [f32]) -> bool {
-        let largest = self.largest(position(mean));
+    /// Shortens the scales of one splat to the bound and to `most`; returns whether any was too
+    /// large.
+    fn shorten(&self, mean: &[f32; 3], log_scales: &mut [f32], most: f32) -> bool {
+        let largest = self.largest(position(mean)).min(most);
         let mut changed = false;
         for s in log_scales.iter_mut().filter(|s| **s > largest) {
             (*s, changed) = (largest, true);
@@ -63,20 +64,26 @@ impl Bounds {
         let rows: Vec<usize> = (0..splats.len()).into_par_iter().filter(is_far).collect();
         let mut splats = splats.picked(&rows);
         splats.means.par_iter().zip(&mut splats.log_scales).for_each(|(mean, scales)| {
-            self.shorten(mean, scales);
+            self.shorten(mean, scales, f32::INFINITY);
         });
         splats
     }
 
-    /// [`Bounds::clamp_to_bounds`] for splats in training. Returns whether splats were removed,
-    /// which makes recordings of steps invalid.
+    /// [`Bounds::clamp_to_bounds`] for splats in training; those that no photo shows do not grow.
+    /// Returns whether splats were removed, which makes recordings of steps invalid.
     pub(super) fn clamp_model_to_bounds(&self, model: &mut Model) -> Result<bool> {
         let means = model.values.means.read()?;
         let mut scales = model.values.log_scales.read()?;
         let splats = || means.par_chunks_exact(3).map(|m| [m[0], m[1], m[2]]);
         let shortened = splats().zip(scales.par_chunks_exact_mut(3));
-        let changed =
-            shortened.map(|(mean, scales)| self.shorten(&mean, scales)).reduce(|| false, |a, b| a | b);
+        let most = |row: usize| {
+            let unseen = row.checked_sub(model.first_unseen());
+            unseen.map_or(f32::INFINITY, |unseen| model.unseen[unseen])
+        };
+        let changed = shortened
+            .enumerate()
+            .map(|(row, (mean, scales))| self.shorten(&mean, scales, most(row)))
+            .reduce(|| false, |a, b| a | b);
         if changed {
             model.values.log_scales.write(&scales)?;
         }
@@ -162,6 +169,20 @@ mod tests {
         assert!(bounds().clamp_model_to_bounds(&mut model).unwrap());
         assert_eq!(model.splats().unwrap(), bounds().clamp_to_bounds(given));
         assert!(!bounds().clamp_model_to_bounds(&mut model).unwrap(), "once is enough");
+    }
+
+    #[test]
+    fn splats_that_no_photo_shows_do_not_grow() {
+        let device = crate::gpu::test_device();
+        let given = splats(&[([0.0, 0.0, 2.0], 0.2), ([0.0, 0.0, 0.9], 0.01), ([0.5, 0.0, 2.0], 0.2)]);
+        let mut model = Model::new(&device, &given, 0).unwrap();
+        model.unseen = [0.01f32, 0.1].map(f32::ln).into();
+        assert!(bounds().clamp_model_to_bounds(&mut model).unwrap(), "the second is too near");
+        let sizes: Vec<f32> = model.splats().unwrap().log_scales.iter().map(|s| s[0].exp()).collect();
+        assert!((sizes[0] - 0.2).abs() < 1e-6 && (sizes[1] - 0.1).abs() < 1e-6, "{sizes:?}");
+        assert_eq!(model.unseen, [0.1f32.ln()], "the rest keeps its sizes");
+        let restored = Model::restored(&device, &model.state().unwrap()).unwrap();
+        assert_eq!(restored.unseen, model.unseen);
     }
 
     #[test]

@@ -48,6 +48,8 @@ pub(super) struct Model {
     moments: [Moments; 5],
     feature_moments: Moments,
     schedule: Schedule,
+    /// Largest log-scale of each of the last rows, the splats that no photo shows.
+    pub(super) unseen: Vec<f32>,
     /// Number of steps in the moments.
     step: usize,
 }
@@ -61,6 +63,7 @@ pub(super) struct State {
     /// Moments per class, then of the features.
     moments: Vec<Vec<f32>>,
     step: usize,
+    unseen: Vec<f32>,
 }
 
 impl Model {
@@ -69,7 +72,8 @@ impl Model {
         let (splats, features) = self.values.download()?;
         let all = self.moments.iter().chain([&self.feature_moments]);
         let moments = all.map(|m| m.buffer.read()).collect::<gpu::Result<_>>()?;
-        Ok(State { splats, features, feature_dim: self.values.feature_dim, moments, step: self.step })
+        let (feature_dim, unseen) = (self.values.feature_dim, self.unseen.clone());
+        Ok(State { splats, features, feature_dim, moments, step: self.step, unseen })
     }
 
     /// Restores a model from its state.
@@ -79,7 +83,7 @@ impl Model {
         for (own, kept) in model.moments.iter().chain([&model.feature_moments]).zip(&state.moments) {
             own.buffer.write(kept)?;
         }
-        model.step = state.step;
+        (model.step, model.unseen) = (state.step, state.unseen.clone());
         Ok(model)
     }
 
@@ -103,6 +107,7 @@ impl Model {
             gradients: gradients_of(device, &values)?,
             feature_gradients: device.buffer::<f32>("gradient features", (n * feature_dim).max(4))?,
             values,
+            unseen: Vec::new(),
             step: 0,
         })
     }
@@ -119,6 +124,11 @@ impl Model {
     /// Number of splats.
     pub(super) fn count(&self) -> usize {
         self.values.count
+    }
+
+    /// Row of the first splat that no photo shows.
+    pub(super) fn first_unseen(&self) -> usize {
+        self.count() - self.unseen.len()
     }
 
     /// Sets the rates of the next step; `extent` scales the rate of the means.
@@ -226,6 +236,9 @@ impl Model {
         self.feature_moments = Moments::new(device, n * dim)?;
         self.gradients = gradients_of(device, &values)?;
         self.feature_gradients = device.buffer::<f32>("gradient features", (n * dim).max(4))?;
+        let first = self.first_unseen();
+        let last = rows.iter().filter_map(|row| (*row as usize).checked_sub(first));
+        self.unseen = last.map(|row| self.unseen[row]).collect();
         self.values = values;
         Ok(true)
     }

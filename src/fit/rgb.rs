@@ -127,13 +127,15 @@ pub(crate) fn train_photos(
     progress.begin("initial splats", 2);
     let mut start = splats_from_points(points, &options.init, options.seed)?;
     progress.step(1, "");
-    start.append(continued_surfaces(&photos, options));
+    let mut unseen = continued_surfaces(&photos, options);
     if options.bounded {
-        start = Bounds::new(cameras, &points.positions).clamp_to_bounds(start);
+        let bounds = Bounds::new(cameras, &points.positions);
+        (start, unseen) = (bounds.clamp_to_bounds(start), bounds.clamp_to_bounds(unseen));
     }
     let scale = SceneScale::of(cameras, points);
     progress.end();
-    Ok(fit_photos(device, photos, start, scale, options, progress)?.with_backdrop(&photos, options))
+    let trained = fit_with_unseen(device, photos, start, unseen, scale, options, progress)?;
+    Ok(trained.with_backdrop(&photos, options))
 }
 
 /// [`train_rgb`] from given splats instead of points, with their SH degree.
@@ -160,9 +162,26 @@ pub(crate) fn fit_photos(
     options: &RgbOptions,
     progress: &dyn Progress,
 ) -> Result<Trained> {
+    fit_with_unseen(device, photos, start, Splats::default(), scale, options, progress)
+}
+
+/// [`fit_photos`] with splats of continued surfaces. They are trained, since photos show some of
+/// them at borders and edges, but do not grow: no photo would hold that against them.
+pub(super) fn fit_with_unseen(
+    device: &Device,
+    photos: Photos,
+    mut start: Splats,
+    unseen: Splats,
+    scale: SceneScale,
+    options: &RgbOptions,
+    progress: &dyn Progress,
+) -> Result<Trained> {
     let clock = Instant::now();
     progress.begin("splats", options.iterations as u64);
+    let largest = unseen.log_scales.iter().map(|s| s[0].max(s[1]).max(s[2])).collect();
+    start.append_raised(unseen);
     let mut run = Run::new(device, photos, &start, scale, options)?;
+    run.trainer.model.unseen = largest;
     training::train(&mut run, 0, options.iterations, progress)?;
     let (splats, cameras, psnr, poses_refined) = run.finish()?;
     progress.end();

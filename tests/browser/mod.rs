@@ -1,6 +1,8 @@
 //! A headless Chromium, driven over the DevTools protocol through a pipe: nothing to install beside
 //! the browser itself.
 #![allow(dead_code, clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+pub mod pictures;
+
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Write};
 use std::process::{Child, ChildStdin, Command, Stdio};
