@@ -19,8 +19,8 @@ use splatvk::run::ask::QueryScene;
 use splatvk::run::metric::{self, Length};
 use splatvk::run::sources;
 use splatvk::run::view::Viewer;
-use splatvk::scene::{Image, LanguageField, RgbImage, Seen};
-use std::path::{Path, PathBuf};
+use splatvk::scene::{LanguageField, Seen};
+use std::path::Path;
 
 #[test]
 fn served_view_draws_and_answers() {
