@@ -14,7 +14,7 @@ layout(push_constant) uniform Push { uint count; uint tiles_x; uint first_row; u
 void main() {
     uint rank = gl_GlobalInvocationID.x;
     if (rank >= count) return;
-    Ellipse e = ellipse_of(depth_pairs[rank].y, first_row, end_row);
+    Ellipse e = ellipse_of(depth_pairs[rank].y, first_row, end_row, tiles_x);
     uint sum = 0;
     for (int row = e.first_row; row <= e.last_row; row++) {
         ivec2 interval = interval_of(e, row, tiles_x);

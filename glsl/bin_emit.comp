@@ -1,6 +1,7 @@
 #version 450
 // Grouping by counting: writes the entries, for every splat in depth order its tiles, row by row.
-// All lanes write the same number of entries, so many lanes share a splat that covers the screen.
+// All lanes have the same number of entries and splats together: many lanes share a splat that
+// covers the screen, and none walks over most of the splats that have no tile (LOOP_ROUNDS).
 // If the entries do not fit, none is written and the status holds the number needed: the image then
 // has no splats at all, never a few missing. Reference: pass::bin.
 //
@@ -20,20 +21,23 @@ layout(std430, binding = 3) buffer Status { uint status[]; };  // [3] see FrameB
 layout(std430, binding = 4) writeonly buffer EntryCount { uint entry_count; };
 layout(std430, binding = 5) writeonly buffer Entries { uvec2 entries[]; };  // [capacity] (tile, splat)
 layout(std430, binding = 6) buffer Counters { uint counters[]; };  // [tiles, lanes]
+layout(std430, binding = 7) writeonly buffer LaneStarts { uint lane_starts[]; };  // [lanes] first entries
 layout(push_constant) uniform Push {
     uint count; uint tiles_x; uint first_row; uint end_row; uint lanes; uint capacity;
 };
 
 #include "shared/tiles.glsl"
 
-// Last rank whose entries begin at or before `entry`: the one that contains it.
-uint rank_of(uint entry) {
+// Rank and entry at which a lane begins, `cost` entries and splats after the first: every splat
+// counts one more than its entries.
+uvec2 begin_at(uint cost, uint total) {
     uint low = 0, high = count;
     while (high - low > 1) {
         uint middle = (low + high) / 2;
-        if (starts[middle] <= entry) low = middle; else high = middle;
+        if (starts[middle] + middle <= cost) low = middle; else high = middle;
     }
-    return low;
+    uint next = high < count ? starts[high] : total;
+    return uvec2(low, min(cost - low, next));
 }
 
 void main() {
@@ -44,12 +48,14 @@ void main() {
         entry_count = fits ? total : 0;
         if (!fits) status[1] = max(status[1], total);
     }
-    uint share = (total + lanes - 1) / lanes;
-    uint begin = lane * share, end = min(begin + share, total);
+    uint share = (total + count + lanes - 1) / lanes;
+    uvec2 first = begin_at(lane * share, total);
+    uint rank = first.x, begin = first.y, end = begin_at(lane * share + share, total).y;
+    lane_starts[lane] = begin;
     if (!fits || begin >= end) return;
 
-    uint rank = rank_of(begin), entry = starts[rank], splat = depth_pairs[rank].y;
-    Ellipse e = ellipse_of(splat, first_row, end_row);
+    uint entry = starts[rank], splat = depth_pairs[rank].y;
+    Ellipse e = ellipse_of(splat, first_row, end_row, tiles_x);
     int row = e.first_row - 1, x = 0, last = -1;
     // One flat loop over (splat, row, tile): lanes with small splats do not wait for lanes with
     // large ones.
@@ -60,7 +66,7 @@ void main() {
             if (row > e.last_row) {
                 rank++;
                 splat = depth_pairs[rank].y;
-                e = ellipse_of(splat, first_row, end_row);
+                e = ellipse_of(splat, first_row, end_row, tiles_x);
                 row = e.first_row;
             }
             ivec2 interval = interval_of(e, row, tiles_x);

@@ -9,14 +9,15 @@ layout(std430, binding = 1) readonly buffer Entries { uvec2 entries[]; };
 layout(std430, binding = 2) buffer Counters { uint counters[]; };  // [tiles, lanes] positions
 // [capacity] (splat, entry).
 layout(std430, binding = 3) writeonly buffer TileSplats { uvec2 tile_splats[]; };
+layout(std430, binding = 4) readonly buffer LaneStarts { uint lane_starts[]; };  // [lanes] first entries
 layout(push_constant) uniform Push { uint lanes; };
 
 void main() {
     uint lane = gl_GlobalInvocationID.x;
     if (lane >= lanes) return;
-    uint share = (entry_count + lanes - 1) / lanes;
-    uint end = min(lane * share + share, entry_count);
-    for (uint i = lane * share; i < end; i++) {
+    // 0 where the entries did not fit: none is written.
+    uint total = entry_count, end = lane + 1 < lanes ? min(lane_starts[lane + 1], total) : total;
+    for (uint i = lane_starts[lane]; i < end; i++) {
         uvec2 entry = entries[i];
         uint at = entry.x * lanes + lane, place = counters[at];
         counters[at] = place + 1;

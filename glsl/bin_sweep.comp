@@ -84,7 +84,7 @@ uint tiles_of(uint splat, Ellipse e) {
     }
     for (LaneSet left = lanes_where(tall); !is_empty(left); left = without_lowest(left)) {
         uint leader = lowest(left);
-        Ellipse other = ellipse_of(subgroupShuffle(splat, leader), first_row, end_row);
+        Ellipse other = ellipse_of(subgroupShuffle(splat, leader), first_row, end_row, tiles_x);
         uint part = 0u;
         int first = other.first_row + int(gl_SubgroupInvocationID);
         for (int row = first; row <= other.last_row; row += SUBGROUP_SIZE) {
@@ -98,7 +98,7 @@ uint tiles_of(uint splat, Ellipse e) {
 
 Ellipse ellipse_at(uint rank, out uint splat) {
     splat = rank < count ? depth_pairs[rank].y : 0u;
-    Ellipse e = ellipse_of(splat, first_row, end_row);
+    Ellipse e = ellipse_of(splat, first_row, end_row, tiles_x);
     if (rank >= count) e.last_row = -1;
     return e;
 }

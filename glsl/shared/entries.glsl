@@ -42,7 +42,7 @@ void write_entry(uint entry, int row, int x, uint splat) {
 // `parts`-th batch of SUBGROUP_SIZE entries, from number `part` on.
 void write_by_subgroup(uint splat, uint at, uint part, uint parts) {
     uint lane = gl_SubgroupInvocationID;
-    Ellipse e = ellipse_of(splat, first_row, end_row);
+    Ellipse e = ellipse_of(splat, first_row, end_row, tiles_x);
     for (int base = e.first_row; base <= e.last_row; base += SUBGROUP_SIZE) {
         int row = base + int(lane);
         ivec2 interval = interval_of(e, row, tiles_x);

@@ -47,7 +47,7 @@ fn record_counting(
     frame: &FrameBuffers,
     rows: &Range<u32>,
     (count, splat_count): (u32, &Buffer<u32>),
-    Counting { scan, counters, lanes }: &Counting,
+    Counting { scan, counters, lane_starts, lanes }: &Counting,
 ) {
     let (tiles_x, lists, lanes) = (frame.tiles()[0], &frame.lists, *lanes);
     let (first_row, end_row, tiles) = (rows.start, rows.end, tiles_x * (rows.end - rows.start));
@@ -71,6 +71,7 @@ fn record_counting(
             entry_count: &lists.entry_count,
             entries: &lists.entries,
             counters,
+            lane_starts,
         },
         &shaders::bin_emit::Push {
             count,
@@ -82,14 +83,14 @@ fn record_counting(
         },
     );
     rec.dispatch_threads(call, [lanes, 1, 1]);
-    group_by_counting(rec, frame, tiles, counters, lanes);
+    group_by_counting(rec, frame, tiles, (counters, lane_starts), lanes);
 }
 
 fn group_by_counting(
     rec: &mut Recorder,
     frame: &FrameBuffers,
     tiles: u32,
-    counters: &Buffer<u32>,
+    (counters, lane_starts): (&Buffer<u32>, &Buffer<u32>),
     lanes: u32,
 ) {
     let (lists, status) = (&frame.lists, &frame.status);
@@ -115,6 +116,7 @@ fn group_by_counting(
             entries: &lists.entries,
             counters,
             tile_splats: &lists.splats,
+            lane_starts,
         },
         &shaders::bin_scatter::Push { lanes },
     );

@@ -92,7 +92,7 @@ impl DeviceChoices {
 /// [`GradientReduction::Entries`].
 fn most_entries(
     device: &Device,
-    (grouping, tiles): (TileBinning, usize),
+    (grouping, splats, tiles): (TileBinning, usize, usize),
     summation: GradientReduction,
     feature_dim: usize,
 ) -> usize {
@@ -100,7 +100,7 @@ fn most_entries(
         GradientReduction::Atomics => usize::MAX,
         GradientReduction::Entries => device.info().max_storage_range as usize / entry_bytes(feature_dim),
     };
-    tile_lists::most_entries(device, grouping, tiles).min(gradients)
+    tile_lists::most_entries(device, grouping, splats, tiles).min(gradients)
 }
 
 /// Renders up to N splats with d features at a fixed image size, and back-propagates gradients.
@@ -155,7 +155,7 @@ impl Rasterizer {
         let stride = feature_dim.next_multiple_of(4);
         // About five entries per splat on the seeded scene; `forward` grows lists that are too
         // short.
-        let most = most_entries(device, (choices.grouping, tiles), choices.summation, feature_dim);
+        let most = most_entries(device, (choices.grouping, splats, tiles), choices.summation, feature_dim);
         let entries = (8 * splats + 4 * tiles).min(most);
         let frame = FrameBuffers {
             width,
@@ -466,7 +466,8 @@ impl Rasterizer {
     /// once where the device binds no longer lists. Earlier recordings must not be run again.
     pub fn grow(&mut self, needed: usize) -> Result<()> {
         let tiles = self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(TILE) as usize;
-        let lists = (self.grouping, tiles);
+        let splats = self.capacity.max(1);
+        let lists = (self.grouping, splats, tiles);
         let most = most_entries(&self.device, lists, self.frame.summation, self.frame.feature_dim);
         let wanted = needed + needed / 4;
         if needed > most {
@@ -479,7 +480,6 @@ impl Rasterizer {
             }
             self.strip = ((u64::from(self.strip) * most as u64 / wanted as u64) as u32).max(1);
         }
-        let splats = self.capacity.max(1);
         let capacity = wanted.min(most);
         self.frame.lists = TileLists::new(&self.device, self.grouping, splats, tiles, capacity)?;
         Ok(self.frame.status.write(&[0; 3])?)

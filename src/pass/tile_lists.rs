@@ -57,6 +57,8 @@ pub(super) struct Counting {
     pub scan: Scan,
     /// [tiles, lanes].
     pub counters: Buffer<u32>,
+    /// [lanes] first entry of each lane.
+    pub lane_starts: Buffer<u32>,
     pub lanes: u32,
 }
 
@@ -73,7 +75,7 @@ pub(super) struct Sorting {
 /// Splats per workgroup of `glsl/bin_sweep.comp`.
 pub(super) const CHUNK_SPLATS: usize = shaders::bin_sweep::CHUNK_SPLATS as usize;
 
-/// Most entries of a lane of [`TileBinning::Counting`]: its loop also visits rows and splats
+/// Most entries and splats of a lane of [`TileBinning::Counting`]: its loop also visits a few rows
 /// without entries.
 const SHARE: usize = LOOP_ROUNDS / 2;
 
@@ -92,9 +94,10 @@ impl TileLists {
     ) -> Result<TileLists> {
         let group = match grouping {
             TileBinning::Counting => {
-                let lanes = counting_lanes(tiles, capacity, device.info().max_storage_range);
+                let lanes = counting_lanes(tiles, capacity + splats, device.info().max_storage_range);
                 let counters = device.buffer::<u32>("tile counters", tiles * lanes as usize)?;
-                Group::Counting(Counting { scan: Scan::new(device)?, counters, lanes })
+                let lane_starts = device.buffer::<u32>("lane starts", lanes as usize)?;
+                Group::Counting(Counting { scan: Scan::new(device)?, counters, lane_starts, lanes })
             }
             TileBinning::Sorting => {
                 let chunks = splats.div_ceil(CHUNK_SPLATS).max(1);
@@ -146,9 +149,10 @@ pub(super) fn tile_bits(tiles: u32) -> u32 {
 }
 
 /// Number of lanes of [`TileBinning::Counting`]. Few lanes keep a CPU device busy, and more only
-/// add counters to clear and scan, unless a lane would exceed its [`SHARE`].
-fn counting_lanes(tiles: usize, capacity: usize, binding: u64) -> u32 {
-    capacity.div_ceil(SHARE).max(64).min(most_lanes(tiles, binding)) as u32 / 8 * 8
+/// add counters to clear and scan, unless a lane would exceed its [`SHARE`] of the `work`, entries
+/// and splats.
+fn counting_lanes(tiles: usize, work: usize, binding: u64) -> u32 {
+    work.div_ceil(SHARE).max(64).min(most_lanes(tiles, binding)) as u32 / 8 * 8
 }
 
 /// Most lanes that memory allows: 16 M counters are 64 MiB, half of the smallest buffer limit that
@@ -161,12 +165,15 @@ fn most_lanes(tiles: usize, binding: u64) -> usize {
 /// Bytes per entry of the widest list.
 const ENTRY_BYTES: u64 = 8;
 
-/// Most entries that the device binds and the lanes of [`TileBinning::Counting`] process.
-pub(super) fn most_entries(device: &Device, grouping: TileBinning, tiles: usize) -> usize {
+/// Most entries of `splats` splats that the device binds and the lanes of [`TileBinning::Counting`]
+/// process; at least the splats of a lane.
+pub(super) fn most_entries(device: &Device, grouping: TileBinning, splats: usize, tiles: usize) -> usize {
     let binding = device.info().max_storage_range;
     let bound = (binding / ENTRY_BYTES) as usize;
     match grouping {
-        TileBinning::Counting => bound.min(most_lanes(tiles, binding) * SHARE),
+        TileBinning::Counting => {
+            bound.min((most_lanes(tiles, binding) * SHARE).saturating_sub(splats).max(SHARE))
+        }
         TileBinning::Sorting => bound,
     }
 }
