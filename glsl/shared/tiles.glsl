@@ -22,26 +22,26 @@ struct Ellipse { // A' dx² + B' dx dy + C' dy² + k = 0, with A', C' < 0
 const float ROW_SLACK = 0.0625;
 
 // Ellipse of a splat, with its rows of tiles within `begin` .. `end`: those that it reaches within
-// the `columns` of tiles. A near splat beside the image has hundreds of rows, all without a tile.
+// the `columns` of tiles, and at most one where it reaches none. A near splat beside the image would
+// have hundreds.
 Ellipse ellipse_of(uint splat, uint begin, uint end, uint columns) {
     vec4 p = projected[PROJECTED_VECTORS * splat], q = projected[PROJECTED_VECTORS * splat + 1];
     precise float inv_a = 1.0 / p.z, det = q.z;
     precise float k = max(q.y - LOG2_ALPHA_MIN + MARGIN, 0.0) * p.z;
-    precise float half_height = sqrt(max(-k / det, 0.0)), half_width = sqrt(max(-k * inv_a * q.x / det, 0.0));
-    precise float slope = -0.5 * p.w * inv_a, right_dy = -0.5 * p.w / q.x * half_width;
+    precise float kc = k * inv_a * q.x; // C' k
+    precise float half_height = sqrt(max(-k / det, 0.0)), half_width = sqrt(max(-kc / det, 0.0));
+    precise float slope = -0.5 * p.w * inv_a, slope_y = -0.5 * p.w / q.x, right_dy = slope_y * half_width;
     Ellipse e = Ellipse(p.x, p.y, inv_a, det, k, slope, right_dy, 0, 0);
     // Its lowest and highest points, or where it leaves the columns.
     precise float low = -e.u, high = low + float(columns * TILE - 1);
     precise float lowest = slope * half_height;
     precise float bottom = clamp(lowest, low, high), top = clamp(-lowest, low, high);
-    precise float kc = k * inv_a * q.x, slope_y = -0.5 * p.w / q.x;
     precise float down = bottom == lowest ? half_height : slope_y * bottom - sqrt(max(-kc - det * bottom * bottom, 0.0)) / q.x;
     precise float up = top == -lowest ? -half_height : slope_y * top + sqrt(max(-kc - det * top * top, 0.0)) / q.x;
     // Clamped as floats first: a far splat must not overflow the conversion to int.
     e.first_row = int(clamp(ceil((e.v + up - ROW_SLACK - float(TILE - 1)) / float(TILE)), float(begin), float(end)));
     e.last_row = int(clamp(floor((e.v + down + ROW_SLACK) / float(TILE)), float(begin) - 1.0, float(end) - 1.0));
-    bool beside = low - ROW_SLACK > half_width || high + ROW_SLACK < -half_width;
-    if (beside || q.y < LOG2_ALPHA_MIN) e.last_row = e.first_row - 1;
+    if (q.y < LOG2_ALPHA_MIN) e.last_row = e.first_row - 1;
     return e;
 }
 
