@@ -27,6 +27,10 @@ const TESTED: usize = 150;
 const REFUTED_SHARE: f32 = 0.1;
 /// Least share of the rim on the plane.
 const RIM_INLIERS: f32 = 0.15;
+/// RGB distance to the mean colour of a face at which the weight of a pixel of its rim falls to 1/e …
+const SAME_COLOUR: f32 = 0.15;
+/// … and the least weight: the table below a thing has most of the rim, and seldom its colour.
+const FOREIGN: f32 = 0.1;
 /// Factor on the rim of a plane along an axis: most corners are right angles, and the rim often
 /// leaves the tilt about its front edge open.
 const RIGHT_ANGLE: f32 = 1.2;
@@ -58,6 +62,14 @@ pub fn faces(
         out.confidence[index] = INFERRED;
     }
     Some(out)
+}
+
+/// Pixel beside a face.
+struct RimPixel {
+    ray: Vec3,
+    inverse: f32,
+    /// Share in the score of a plane.
+    weight: f32,
 }
 
 struct View<'a> {
@@ -175,7 +187,8 @@ impl<'a> View<'a> {
         let mut state = seed;
         let mut draw = || {
             state = hash(state);
-            rim[state as usize % rim.len()]
+            let pixel = &rim[state as usize % rim.len()];
+            (pixel.ray, pixel.inverse)
         };
         let mut planes = Vec::new();
         for axis in &axes {
@@ -187,10 +200,8 @@ impl<'a> View<'a> {
             planes.extend(through_points([draw(), draw(), draw()]).map(|plane| (plane, 1.0)));
         }
         let tolerance = self.level.tolerance[self.view];
-        let inliers = |plane: Vec3| {
-            let on = |(ray, inverse): &&(Vec3, f32)| (plane.dot(*ray) - inverse).abs() < tolerance * inverse;
-            rim.iter().filter(on).count()
-        };
+        let on = |plane: Vec3, p: &RimPixel| (plane.dot(p.ray) - p.inverse).abs() < tolerance * p.inverse;
+        let weight_on = |plane: Vec3| rim.iter().filter(|p| on(plane, p)).map(|p| p.weight).sum::<f32>();
         let most_refuted = (REFUTED_SHARE * tested.len() as f32) as usize;
         let is_sound = |plane: &Vec3| {
             let mut wrong = 0;
@@ -199,9 +210,9 @@ impl<'a> View<'a> {
                 wrong <= most_refuted
             })
         };
-        let least = RIM_INLIERS * rim.len() as f32;
+        let least = RIM_INLIERS * rim.iter().map(|p| p.weight).sum::<f32>();
         let mut scored: Vec<(f32, Vec3)> =
-            planes.into_iter().map(|(plane, factor)| (factor * inliers(plane) as f32, plane)).collect();
+            planes.into_iter().map(|(plane, factor)| (factor * weight_on(plane), plane)).collect();
         scored.retain(|(score, _)| *score >= least);
         // The order of equal ones is that of the draws.
         scored.sort_by(|a, b| b.0.total_cmp(&a.0));
@@ -215,8 +226,9 @@ impl<'a> View<'a> {
         Some(enough.map(|(_, plane)| plane).filter(is_sound).fold(best.1, nearer))
     }
 
-    /// Rays and inverse depths of pixels around a face, of those that no view refutes.
-    fn rim(&self, face: &[usize], refuted: &[bool]) -> Vec<(Vec3, f32)> {
+    /// Pixels around a face, of those that no view refutes. Those of the face's colour are likely of
+    /// the same thing.
+    fn rim(&self, face: &[usize], refuted: &[bool]) -> Vec<RimPixel> {
         let radius = ((RIM_SHARE * self.width as f32) as usize).max(4);
         let place = |k: usize| (k % self.width, k / self.width);
         let bounds = |axis: fn((usize, usize)) -> usize, count: usize| {
@@ -241,11 +253,14 @@ impl<'a> View<'a> {
             |i: usize| (rows.start + i / columns.len()) * self.width + columns.start + i % columns.len();
         let known = |k: &usize| !refuted[*k] && self.complete.confidence[self.first + k] > 0.0;
         let pixels: Vec<usize> = (0..near.len()).filter(|i| near[*i]).map(index).filter(known).collect();
-        let value = |k: usize| {
+        let colour = |k: usize| Vec3::from(self.level.guide[self.view].data[k]);
+        let mean = face.iter().map(|k| colour(*k)).sum::<Vec3>() / face.len() as f32;
+        let pixel = |k: usize| {
             let ray = self.ray(k);
-            (ray, self.complete.planes[self.first + k].dot(ray))
+            let weight = FOREIGN + (-colour(k).distance(mean) / SAME_COLOUR).exp();
+            RimPixel { ray, inverse: self.complete.planes[self.first + k].dot(ray), weight }
         };
-        every(&pixels, 4 * TESTED).into_iter().map(value).filter(|(_, inverse)| *inverse > 0.0).collect()
+        every(&pixels, 4 * TESTED).into_iter().map(pixel).filter(|p| p.inverse > 0.0).collect()
     }
 }
 
