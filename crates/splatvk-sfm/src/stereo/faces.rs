@@ -311,9 +311,14 @@ mod tests {
         (wall, [0.2, 0.6, 0.5 + 0.2 * (5.0 * wall.x).sin() as f32])
     }
 
-    #[test]
-    fn side_of_box_gets_its_plane() {
-        // The first camera alone stands to the left of the box.
+    /// True for points of the side.
+    fn is_side(point: DVec3) -> bool {
+        (2.001..2.61).contains(&point.z)
+    }
+
+    /// Three views, of which the first alone stands to the left of the box, with what they match: the
+    /// front and the wall where another view shows them, too.
+    fn box_scene() -> ([Camera; 3], Level, Surface) {
         let cameras = [camera_at(-0.9), camera_at(0.0), camera_at(0.4)];
         let images = cameras.each_ref().map(|c| RgbImage {
             width: WIDTH,
@@ -324,22 +329,25 @@ mod tests {
             (0..WIDTH * HEIGHT).step_by(97).map(|k| hit(&cameras[0], pixel_centre(k)).0).collect();
         let options = StereoOptions { rounds: vec![1], ..StereoOptions::default() };
         let level = pyramid(&images, &cameras, &sparse, &options).unwrap().pop().unwrap();
-        let poses = RelativePoses::new(&level);
         let at = |view: usize, x: usize, y: usize| hit(&cameras[view], pixel_centre(y * WIDTH + x)).0;
-        // All views match the front and the wall where another one shows them, too.
         let planes = map_pixels(&level, |view, x, y, _| Vec3::Z / at(view, x, y).z as f32);
         let shown = |point: DVec3, other: usize| {
             let (p, z) = cameras[other].project(point);
             let inside = p.x >= 0.0 && p.y >= 0.0 && p.x < WIDTH as f64 && p.y < HEIGHT as f64;
             inside && z > 0.0 && (hit(&cameras[other], p).0 - point).length() < 0.02
         };
-        let is_side = |point: DVec3| (2.001..2.61).contains(&point.z);
         let confidence = map_pixels(&level, |view, x, y, _| {
             let point = at(view, x, y);
             let twice = (0..3).any(|other| other != view && shown(point, other));
             if twice && !is_side(point) { 0.9 } else { 0.0 }
         });
-        let known = Surface { planes, confidence };
+        (cameras, level, Surface { planes, confidence })
+    }
+
+    #[test]
+    fn side_of_box_gets_its_plane() {
+        let (cameras, level, known) = box_scene();
+        let poses = RelativePoses::new(&level);
         let void = vec![false; level.pixels()];
         let large = planes::large_planes(&level, &known, 1);
         let complete = fill::fill(&level, &poses, &known, &large, &void);
@@ -360,5 +368,23 @@ mod tests {
         // Nothing else is a face.
         let others = with_faces.confidence[WIDTH * HEIGHT..].iter().filter(|c| **c == INFERRED).count();
         assert_eq!(others, 0);
+    }
+    #[test]
+    fn rim_of_own_colour_weighs_more() {
+        let (cameras, level, known) = box_scene();
+        let poses = RelativePoses::new(&level);
+        let view = View::new(&level, &poses, &known, &known, 0);
+        let side: Vec<bool> =
+            (0..WIDTH * HEIGHT).map(|k| is_side(hit(&cameras[0], pixel_centre(k)).0)).collect();
+        let face: Vec<usize> = (0..side.len()).filter(|k| side[*k]).collect();
+        let rim = view.rim(&face, &side);
+        let mean = |inverse: f32| {
+            let weights: Vec<f32> =
+                rim.iter().filter(|p| (p.inverse - inverse).abs() < 0.01).map(|p| p.weight).collect();
+            weights.iter().sum::<f32>() / weights.len() as f32
+        };
+        // The red front of the box at z = 2, the green wall at z = 4.
+        let (front, wall) = (mean(1.0 / 2.0), mean(1.0 / 4.0));
+        assert!(front > 3.0 * wall, "front {front}, wall {wall}");
     }
 }
