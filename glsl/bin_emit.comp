@@ -21,7 +21,8 @@ layout(std430, binding = 3) buffer Status { uint status[]; };  // [3] see FrameB
 layout(std430, binding = 4) writeonly buffer EntryCount { uint entry_count; };
 layout(std430, binding = 5) writeonly buffer Entries { uvec2 entries[]; };  // [capacity] (tile, splat)
 layout(std430, binding = 6) buffer Counters { uint counters[]; };  // [tiles, lanes]
-layout(std430, binding = 7) writeonly buffer LaneStarts { uint lane_starts[]; };  // [lanes] first entries
+// [lanes] first entry.
+layout(std430, binding = 7) writeonly buffer LaneStarts { uint lane_starts[]; };
 layout(push_constant) uniform Push {
     uint count; uint tiles_x; uint first_row; uint end_row; uint lanes; uint capacity;
 };

@@ -9,7 +9,8 @@ layout(std430, binding = 1) readonly buffer Entries { uvec2 entries[]; };
 layout(std430, binding = 2) buffer Counters { uint counters[]; };  // [tiles, lanes] positions
 // [capacity] (splat, entry).
 layout(std430, binding = 3) writeonly buffer TileSplats { uvec2 tile_splats[]; };
-layout(std430, binding = 4) readonly buffer LaneStarts { uint lane_starts[]; };  // [lanes] first entries
+// [lanes] first entry.
+layout(std430, binding = 4) readonly buffer LaneStarts { uint lane_starts[]; };
 layout(push_constant) uniform Push { uint lanes; };
 
 void main() {

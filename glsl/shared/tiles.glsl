@@ -22,8 +22,8 @@ struct Ellipse { // A' dx² + B' dx dy + C' dy² + k = 0, with A', C' < 0
 const float ROW_SLACK = 0.0625;
 
 // Ellipse of a splat, with its rows of tiles within `begin` .. `end`: those that it reaches within
-// the `columns` of tiles, and at most one where it reaches none. A near splat beside the image would
-// have hundreds.
+// the `columns` of tiles, and at most one where it reaches none. A near splat beside the image
+// would have hundreds.
 Ellipse ellipse_of(uint splat, uint begin, uint end, uint columns) {
     vec4 p = projected[PROJECTED_VECTORS * splat], q = projected[PROJECTED_VECTORS * splat + 1];
     precise float inv_a = 1.0 / p.z, det = q.z;

@@ -27,7 +27,7 @@ const TESTED: usize = 150;
 const REFUTED_SHARE: f32 = 0.1;
 /// Least share of the rim on the plane.
 const RIM_INLIERS: f32 = 0.15;
-/// RGB distance to the mean colour of a face at which the weight of a pixel of its rim falls to 1/e …
+/// RGB distance to a face's mean colour at which the weight of a pixel of its rim falls to 1/e …
 const SAME_COLOUR: f32 = 0.15;
 /// … and the least weight: the table below a thing has most of the rim, and seldom its colour.
 const FOREIGN: f32 = 0.1;
@@ -226,8 +226,8 @@ impl<'a> View<'a> {
         Some(enough.map(|(_, plane)| plane).filter(is_sound).fold(best.1, nearer))
     }
 
-    /// Pixels around a face, of those that no view refutes. Those of the face's colour are likely of
-    /// the same thing.
+    /// Pixels around a face, of those that no view refutes. Those of the face's colour are likely
+    /// of the same thing.
     fn rim(&self, face: &[usize], refuted: &[bool]) -> Vec<RimPixel> {
         let radius = ((RIM_SHARE * self.width as f32) as usize).max(4);
         let place = |k: usize| (k % self.width, k / self.width);
@@ -316,8 +316,8 @@ mod tests {
         (2.001..2.61).contains(&point.z)
     }
 
-    /// Three views, of which the first alone stands to the left of the box, with what they match: the
-    /// front and the wall where another view shows them, too.
+    /// Three views, of which the first alone stands to the left of the box. They match the front and
+    /// the wall where another view shows them, too.
     fn box_scene() -> ([Camera; 3], Level, Surface) {
         let cameras = [camera_at(-0.9), camera_at(0.0), camera_at(0.4)];
         let images = cameras.each_ref().map(|c| RgbImage {
