@@ -70,22 +70,27 @@ fn unseen_splats(
     seed: u64,
 ) -> Splats {
     let sky = Sky::of(cameras, depths);
+    let views = images.len().min(depths.len());
+    let shown: Vec<Shown> = (0..views)
+        .map(|v| Shown { image: &images[v], camera: &cameras[v], depth: &depths[v], min_confidence })
+        .collect();
+    let random = |view: usize| Random::new(seed ^ 0x3a61 ^ ((view as u64) << 32));
+    let borders: Vec<Vec<Anchor>> =
+        (0..views).into_par_iter().map(|v| anchor::at_border(&shown[v], &mut random(v))).collect();
     let splats_of_view = |view: usize| -> Vec<UnseenSplat> {
-        let shown =
-            Shown { image: &images[view], camera: &cameras[view], depth: &depths[view], min_confidence };
-        let mut random = Random::new(seed ^ 0x3a61 ^ ((view as u64) << 32));
-        let mut own = candidates(&shown, sky.as_ref(), reach * shown.long(), &mut random);
+        let reach = reach * shown[view].long();
+        let mut own = candidates(&shown[view], &borders[view], sky.as_ref(), reach, &mut random(view));
         let in_photo = |c: &UnseenSplat, v: usize| {
             depth_at(c, &cameras[v], &depths[v]).is_some_and(|(z, known)| known <= 0.0 || z < BEHIND * known)
         };
         let in_view = |c: &UnseenSplat, (camera, depth): &(Camera, DepthMap)| {
             depth_at(c, camera, depth).is_some_and(|(z, known)| known > 0.0 && z < known / BEHIND)
         };
-        own.retain(|c| !(0..depths.len()).any(|v| v != view && in_photo(c, v)));
+        own.retain(|c| !(0..views).any(|v| v != view && in_photo(c, v)));
+        own.retain(|c| !(0..views).any(|v| v != view && before_nearer_border(c, &shown[v], &borders[v])));
         own.retain(|c| !beside.iter().any(|v| in_view(c, v)));
         own
     };
-    let views = images.len().min(depths.len());
     let mut all: Vec<UnseenSplat> = (0..views).into_par_iter().flat_map(splats_of_view).collect();
     // Where several photos continue one surface, the nearest end has priority.
     all.sort_by(|a, b| a.distance.total_cmp(&b.distance));
@@ -138,12 +143,17 @@ impl Sky {
 
 /// Candidates around one photo and behind its surfaces, up to `reach` pixels from the end of a
 /// surface.
-fn candidates(shown: &Shown, sky: Option<&Sky>, reach: f64, random: &mut Random) -> Vec<UnseenSplat> {
+fn candidates(
+    shown: &Shown,
+    borders: &[Anchor],
+    sky: Option<&Sky>,
+    reach: f64,
+    random: &mut Random,
+) -> Vec<UnseenSplat> {
     let size = shown.size();
     // Hidden surfaces appear in narrow gaps, so their grid is twice as fine as beyond the borders.
     let (step, fine) = (STEP * shown.long(), 0.5 * STEP * shown.long());
     let revealed = REVEALED * shown.long();
-    let borders = anchor::at_border(shown, random);
     let mut edges = anchor::at_edges(shown, fine, random);
     // Sky continues beyond the borders. Behind surfaces it is left to the backdrop: splats of its
     // size would shine through every gap of the ground.
@@ -157,7 +167,7 @@ fn candidates(shown: &Shown, sky: Option<&Sky>, reach: f64, random: &mut Random)
     let beyond = |pixel: DVec2| -> Option<[Option<UnseenSplat>; 2]> {
         let border = pixel.clamp(DVec2::ZERO, size);
         let outside = border != pixel && border.distance(pixel) < reach;
-        let front = Anchor::typical(&borders, border, pixel).filter(|_| outside)?;
+        let front = Anchor::typical(borders, border, pixel).filter(|_| outside)?;
         // The front surface may end there, so the next one behind it continues, too.
         let next = borders.iter().chain(&edges).filter(|a| a.inverse(pixel) * BEHIND < front.inverse(pixel));
         let next = Anchor::nearest(next, pixel).filter(|a| a.at.distance(pixel) < reach);
@@ -185,6 +195,17 @@ fn depth_at(c: &UnseenSplat, camera: &Camera, map: &DepthMap) -> Option<(f64, f6
     let (w, h) = (map.depth.width as f64, map.depth.height as f64);
     let inside = z > 0.0 && pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < w && pixel.y < h;
     inside.then(|| (z, f64::from(map.depth.at(pixel.x as usize, pixel.y as usize))))
+}
+
+/// Whether a candidate stands before the surface that another photo continues, and lies nearer to
+/// the border of that photo than to the end of its own surface. The roof that one photo cuts off
+/// does not rise above the ridge that another one shows.
+fn before_nearer_border(c: &UnseenSplat, other: &Shown, borders: &[Anchor]) -> bool {
+    let (pixel, z) = other.camera.project(c.position);
+    let border = pixel.clamp(DVec2::ZERO, other.size());
+    let nearer = z > 0.0 && border != pixel && border.distance(pixel) < c.distance;
+    let surface = Anchor::typical(borders, border, pixel).filter(|_| nearer);
+    surface.is_some_and(|a| a.inverse(pixel) * z * BEHIND < 1.0)
 }
 
 /// Candidate that continues the plane of an anchor at a pixel; `None` near or past the horizon.
@@ -383,6 +404,28 @@ mod tests {
         // A wall that recedes is no sky.
         depth.depth.data.iter_mut().enumerate().for_each(|(i, z)| *z = 30.0 - 0.2 * (i / 160) as f32);
         assert!(Sky::of(&[camera()], &[depth]).is_none());
+    }
+
+    #[test]
+    fn wall_ends_where_another_photo_shows_its_end() {
+        // The first photo cuts a wall off at its upper border. The second one, from farther up,
+        // shows that it ends 5 pixels above, and what is far behind.
+        let mut above = camera();
+        above.pose.translation.y += 0.2;
+        let rise = 140.0 * 0.2 / 2.0;
+        let photos = [
+            walls(|_, _| (2.0, [0.2; 3])),
+            walls(|_, y| if (y as f64) < rise - 5.0 { (8.0, [0.8; 3]) } else { (2.0, [0.2; 3]) }),
+        ];
+        let (images, depths): (Vec<_>, Vec<_>) = photos.into_iter().unzip();
+        let cameras = [camera(), above];
+        let risen = |photos: usize| {
+            let splats = unseen_splats(&images[..photos], &cameras, &depths[..photos], &[], 0.2, 0.5, 0);
+            let wall = |(p, z, _): &&(DVec2, f64, f32)| (40.0..120.0).contains(&p.x) && p.y < -6.0 && *z < 3.0;
+            places(&splats).iter().filter(wall).count()
+        };
+        assert!(risen(1) > 100, "alone, the first photo continues it");
+        assert_eq!(risen(2), 0);
     }
 
     #[test]
