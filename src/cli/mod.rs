@@ -28,6 +28,7 @@ pub mod views;
 use crate::{Error, Result, gpu};
 use args::{Cli, Command, LogFormat};
 use clap::{CommandFactory, FromArgMatches};
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 /// A program of commands that share parsing, reporting and exit codes. The laboratory has a second
@@ -51,10 +52,21 @@ pub fn main() -> ExitCode {
     start::<Cli>()
 }
 
-/// Runs the command line of this process: at most one error line, and an exit code by the kind of
-/// the error ([`Error::exit_code`]).
+/// The command line of `splatvk` with the given arguments, of which the first is the name of the
+/// program. Returns the exit code.
+pub fn run_with(arguments: Vec<OsString>) -> u8 {
+    start_with::<Cli>(arguments)
+}
+
+/// Runs the command line of this process.
 pub fn start<P: Program>() -> ExitCode {
-    let program = match usage::parse::<P>() {
+    ExitCode::from(start_with::<P>(std::env::args_os().collect()))
+}
+
+/// Runs a command line: at most one error line, and an exit code by the kind of the error
+/// ([`Error::exit_code`]).
+fn start_with<P: Program>(arguments: Vec<OsString>) -> u8 {
+    let program = match usage::parse::<P>(arguments) {
         Ok(program) => program,
         Err(code) => return code,
     };
@@ -64,11 +76,11 @@ pub fn start<P: Program>() -> ExitCode {
     match program.execute() {
         Ok(()) => {
             progress::release();
-            ExitCode::SUCCESS
+            0
         }
         Err(error) => {
             progress::print_error(&error.to_string(), error.exit_code());
-            ExitCode::from(error.exit_code())
+            error.exit_code()
         }
     }
 }

@@ -5,8 +5,8 @@ use super::line::one_line;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Command, CommandFactory};
 use std::error::Error as _;
+use std::ffi::OsString;
 use std::num::{ParseFloatError, ParseIntError};
-use std::process::ExitCode;
 
 /// Command line of a program, for the parser and for shell completions.
 pub fn command<P: Program>() -> Command {
@@ -41,14 +41,14 @@ fn hide(command: Command, path: &str, options: &[&str]) -> Command {
     }
 }
 
-/// Parses the arguments of this process, or prints the error and returns its exit code.
-pub fn parse<P: Program>() -> Result<P, ExitCode> {
-    let parsed = command::<P>().try_get_matches().and_then(|found| P::from_arg_matches(&found));
+/// Parses arguments, or prints the error and returns its exit code.
+pub fn parse<P: Program>(arguments: Vec<OsString>) -> Result<P, u8> {
+    let parsed = command::<P>().try_get_matches_from(arguments).and_then(|found| P::from_arg_matches(&found));
     parsed.map_err(|error| print_usage_error(&error, &command::<P>()))
 }
 
 /// Prints help and version to standard output, and a usage error as one line with exit code 2.
-fn print_usage_error(error: &clap::Error, all: &Command) -> ExitCode {
+fn print_usage_error(error: &clap::Error, all: &Command) -> u8 {
     let help = matches!(
         error.kind(),
         ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand | ErrorKind::MissingSubcommand
@@ -57,10 +57,10 @@ fn print_usage_error(error: &clap::Error, all: &Command) -> ExitCode {
     if requested || help {
         // A closed pipe while printing help is no failure.
         let _ = error.print();
-        return if requested { ExitCode::SUCCESS } else { ExitCode::from(2) };
+        return if requested { 0 } else { 2 };
     }
     eprintln!("{}: {}", all.get_name(), one_line(&message(error, all)));
-    ExitCode::from(2)
+    2
 }
 
 /// Problem, suggestion and the command whose help shows the rest.

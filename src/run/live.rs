@@ -169,6 +169,39 @@ impl LiveScene {
         self.viewer.draw(camera)
     }
 
+    /// Renders and decodes one camera.
+    pub fn view(&mut self, camera: &Camera) -> Result<DecodedFrame> {
+        check(camera)?;
+        self.viewer.view(camera)
+    }
+
+    /// The splats of `rows` as a scene of their own, with its cameras, photos and language.
+    ///
+    /// # Errors
+    /// Rows that the scene does not have, and a trained scene that is not saved yet.
+    pub fn picked(&self, rows: &[usize]) -> Result<LiveScene> {
+        let count = self.splats().len();
+        if let Some(row) = rows.iter().find(|row| **row >= count) {
+            return Err(Error::input(format!("there is no splat {row}; the scene has {count}")));
+        }
+        let path = match &self.origin {
+            SceneOrigin::Trained(outcome) => &outcome.plan.output.out,
+            SceneOrigin::Loaded(scene) => &scene.path,
+        };
+        if path.as_os_str().is_empty() {
+            return Err(Error::input("save the scene before a part of it is taken"));
+        }
+        let pixels = &self.seen().pixels;
+        let mut scene = Scene::default();
+        scene.path = path.clone();
+        scene.splats = self.splats().picked(rows);
+        scene.seen.pixels = rows.iter().filter_map(|&i| pixels.get(i)).copied().collect();
+        scene.cameras = self.cameras().to_vec();
+        scene.world = self.world().clone();
+        scene.language = self.language().map(|field| field.clone().picked(rows, count));
+        LiveScene::new(&self.device, SceneOrigin::Loaded(Box::new(scene)), &self.registry)
+    }
+
     /// Answers a text for the scene and for one view.
     pub fn ask(&mut self, text: &str, camera: &Camera) -> Result<Answers> {
         check(camera)?;

@@ -421,7 +421,8 @@ mod tests {
         let cameras = [camera(), above];
         let risen = |photos: usize| {
             let splats = unseen_splats(&images[..photos], &cameras, &depths[..photos], &[], 0.2, 0.5, 0);
-            let wall = |(p, z, _): &&(DVec2, f64, f32)| (40.0..120.0).contains(&p.x) && p.y < -6.0 && *z < 3.0;
+            let wall =
+                |(p, z, _): &&(DVec2, f64, f32)| (40.0..120.0).contains(&p.x) && p.y < -6.0 && *z < 3.0;
             places(&splats).iter().filter(wall).count()
         };
         assert!(risen(1) > 100, "alone, the first photo continues it");

@@ -1,0 +1,1 @@
+"""Models of splatvk, in the folder `models` beside this file."""

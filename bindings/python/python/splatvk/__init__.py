@@ -1,0 +1,151 @@
+"""A few photos without camera poses to a Gaussian-splat scene that answers texts.
+
+>>> import splatvk
+>>> scene = splatvk.reconstruct("my-photos", out="kitchen", progress=True)  # doctest: +SKIP
+>>> scene.query("blue mug").presence                                        # doctest: +SKIP
+'found'
+
+Conventions: scene coordinates and cameras have OpenCV axes (x right, y down, z forward); `w2c`
+maps scene coordinates to those of a camera. `quats` are (w, x, y, z). Scales, opacities and
+quaternions are activated values, as gsplat's `rasterization` takes them. Arrays of a scene are
+read-only views of its memory; `numpy.array(...)` copies, `torch.from_dlpack(array.copy())` too.
+"""
+
+import json as _json
+import os as _os
+
+from . import _parts
+
+_parts.find()
+
+from . import _progress, _splatvk  # noqa: E402  the module loads what _parts has found
+from ._splatvk import (  # noqa: E402
+    Answer,
+    Camera,
+    Event,
+    Scene,
+    Thing,
+    __version__,
+    close_device,
+    device_name,
+    load,
+)
+from .errors import (  # noqa: E402
+    Cancelled,
+    DeviceLostError,
+    Error,
+    FileError,
+    ForkError,
+    GpuError,
+    InputError,
+    MissingError,
+    MissingModelError,
+    NoDeviceError,
+    OutOfDeviceMemoryError,
+    UnwritableError,
+    WorkError,
+)
+
+__all__ = [
+    "Answer",
+    "Camera",
+    "Cancelled",
+    "DeviceLostError",
+    "Error",
+    "Event",
+    "FileError",
+    "ForkError",
+    "GpuError",
+    "InputError",
+    "MissingError",
+    "MissingModelError",
+    "NoDeviceError",
+    "OutOfDeviceMemoryError",
+    "Scene",
+    "Thing",
+    "UnwritableError",
+    "WorkError",
+    "__version__",
+    "close_device",
+    "device_name",
+    "load",
+    "reconstruct",
+    "train",
+]
+
+
+# The best installed network, else what is built in.
+_SOURCES = ("init", "depth_prior", "matcher", "masks", "features")
+
+
+def reconstruct(photos, *, out, views=None, queries=(), language=True, progress=False, **options):
+    """Makes a scene from photos, and stores it in the folder `out`.
+
+    Parameters
+    ----------
+    photos : path or sequence of paths
+        Photos, folders of photos, or a video.
+    out : path
+        The scene directory. It is written whole or not at all; `force=True` replaces a scene.
+    views : int, optional
+        How many of the photos are used; without it all, at most 4.
+    queries : sequence of str
+        Texts that the report answers.
+    language : bool
+        False makes a scene of colours alone, which answers no texts and is done sooner.
+    progress : bool or callable
+        True draws bars (tqdm, where it is installed); a callable gets every `Event`, and its
+        exceptions stop the work. Warnings go to the logger `splatvk` unless a callable takes them.
+    **options
+        Options of `splatvk run` with underscores: `preset`, `max_size`, `iterations`, `seed`,
+        `device`, `models`, `force`, `resume`, `init`, `photo_masks`, `sh_degree`, ...
+
+    Returns
+    -------
+    Scene
+
+    Raises
+    ------
+    InputError
+        Photos or options that cannot be used.
+    KeyboardInterrupt
+        After Ctrl-C. Finished stages and the state of training are kept; the same call with
+        `resume=True` continues.
+    """
+    paths = [photos] if isinstance(photos, (str, _os.PathLike)) else list(photos)
+    plan = {
+        "inputs": [_os.fspath(path) for path in paths],
+        "out": _os.fspath(out),
+        "queries": list(queries),
+        "views": views,
+        **dict.fromkeys(_SOURCES, "auto"),
+        **options,
+    }
+    if not language:
+        plan["method"] = "none"
+    for key, value in plan.items():
+        if isinstance(value, _os.PathLike):
+            plan[key] = _os.fspath(value)
+    return _splatvk.reconstruct(_json.dumps(plan), _progress.observer(progress))
+
+
+def train(images, cameras, *, out, views=None, progress=False, **options):
+    """Makes a scene of colours from photos with known cameras, as `splatvk train`.
+
+    Parameters
+    ----------
+    images : path
+        Folder of the photos.
+    cameras : path
+        transforms.json, cameras.json, a COLMAP model, or a data set with one of them.
+    out, views, progress, **options
+        As in `reconstruct`.
+
+    Returns
+    -------
+    Scene
+    """
+    init = f"cameras:{_os.fspath(cameras)}"
+    return reconstruct(
+        images, out=out, views=views, language=False, progress=progress, init=init, **options
+    )

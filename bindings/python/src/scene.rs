@@ -1,0 +1,364 @@
+//! Scenes: made from photos, loaded, read, rendered, asked, saved.
+use crate::answer::Answer;
+use crate::camera::Camera;
+use crate::device::{self, Process};
+use crate::{arrays, errors, work};
+use numpy::{Element, PyReadonlyArray1};
+use pyo3::exceptions::PyIndexError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use serde_json::Value;
+use splatvk::infer::Registry;
+use splatvk::infer::installed::inventory;
+use splatvk::run::live::LiveScene;
+use splatvk::run::{self, RunPlan};
+use splatvk::{Error, Result};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+
+/// A Gaussian-splat scene: N Gaussians in scene units and OpenCV axes, the cameras of its photos,
+/// and what answers texts. Calls of one scene from several threads wait for each other.
+#[pyclass(module = "splatvk", frozen, weakref)]
+pub struct Scene {
+    live: Mutex<LiveScene>,
+    process: Process,
+    /// Where the scene is stored, if it is.
+    path: Mutex<Option<PathBuf>>,
+    scales: OnceLock<Vec<f32>>,
+    quats: OnceLock<Vec<f32>>,
+    opacities: OnceLock<Vec<f32>>,
+    seen: OnceLock<Vec<bool>>,
+}
+
+impl Scene {
+    fn of(live: LiveScene, path: Option<PathBuf>) -> Scene {
+        Scene {
+            live: Mutex::new(live),
+            process: Process::current(),
+            path: Mutex::new(path),
+            scales: OnceLock::new(),
+            quats: OnceLock::new(),
+            opacities: OnceLock::new(),
+            seen: OnceLock::new(),
+        }
+    }
+
+    pub fn live(&self) -> MutexGuard<'_, LiveScene> {
+        self.live.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A call that uses the device, without the GIL.
+    pub fn on_device<T: Send>(
+        &self,
+        py: Python<'_>,
+        body: impl FnOnce(&mut LiveScene) -> Result<T> + Send,
+    ) -> PyResult<T> {
+        self.process.check(py)?;
+        work::unobserved(py, || body(&mut self.live()))
+    }
+
+    /// The camera of an argument: a [`Camera`], the index or the name of one of the scene's own, or
+    /// its first.
+    pub fn camera(
+        &self,
+        py: Python<'_>,
+        given: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<splatvk::scene::Camera> {
+        let refused = |text: String| Err(errors::named(py, "InputError", text));
+        let live = self.live();
+        let own = live.cameras();
+        let Some(given) = given else {
+            return match own.first() {
+                Some(first) => Ok(first.clone()),
+                None => refused("the scene has no cameras; give one".to_owned()),
+            };
+        };
+        if let Ok(camera) = given.cast::<Camera>() {
+            return Ok(camera.get().0.clone());
+        }
+        if let Ok(index) = given.extract::<usize>() {
+            return match own.get(index) {
+                Some(camera) => Ok(camera.clone()),
+                None => refused(format!("there is no camera {index}; the scene has {}", own.len())),
+            };
+        }
+        if let Ok(name) = given.extract::<String>() {
+            return match own
+                .iter()
+                .find(|c| c.name == name || Path::new(&c.name).file_stem() == Some(name.as_ref()))
+            {
+                Some(camera) => Ok(camera.clone()),
+                None => refused(format!("there is no camera called {name:?}")),
+            };
+        }
+        refused("a camera is a splatvk.Camera, the index or the name of one of the scene's own".to_owned())
+    }
+
+    /// Activated values, computed once: what `activate` makes of the splats.
+    fn kept<'py, T: Element>(
+        this: &Bound<'py, Self>,
+        slot: impl FnOnce(&Scene) -> &OnceLock<Vec<T>>,
+        row: &[usize],
+        activate: impl FnOnce(&LiveScene) -> Vec<T>,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let scene = this.get();
+        let values = slot(scene).get_or_init(|| activate(&scene.live()));
+        let count = values.len() / row.iter().product::<usize>().max(1);
+        let shape: Vec<usize> = std::iter::once(count).chain(row.iter().copied()).collect();
+        // SAFETY: a set OnceLock never changes, and `this` keeps it.
+        unsafe { arrays::borrowed(values, &shape, this.clone().into_any()) }
+    }
+}
+
+#[pymethods]
+impl Scene {
+    /// (N, 3) float32, centres.
+    #[getter]
+    fn means<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        let live = this.get().live();
+        let means = &live.splats().means;
+        // SAFETY: a LiveScene never changes its splats, and `this` keeps it.
+        unsafe { arrays::borrowed(means.as_flattened(), &[means.len(), 3], this.clone().into_any()) }
+    }
+    /// (N, (d+1)², 3) float32, spherical harmonics of degree d, as in gsplat.
+    #[getter]
+    fn sh<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        let live = this.get().live();
+        let splats = live.splats();
+        // SAFETY: as in `means`.
+        unsafe { arrays::borrowed(&splats.sh, &[splats.len(), splats.sh_len(), 3], this.clone().into_any()) }
+    }
+    /// (N, 3) float32, standard deviations along the own axes.
+    #[getter]
+    fn scales<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        Self::kept(
+            this,
+            |s| &s.scales,
+            &[3],
+            |live| live.splats().log_scales.as_flattened().iter().map(|v| v.exp()).collect(),
+        )
+    }
+    /// (N, 4) float32, unit quaternions (w, x, y, z).
+    #[getter]
+    fn quats<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        Self::kept(
+            this,
+            |s| &s.quats,
+            &[4],
+            |live| {
+                let unit = |q: &[f32; 4]| {
+                    let length = q.iter().map(|v| v * v).sum::<f32>().sqrt();
+                    q.map(|v| v / length)
+                };
+                live.splats().quats.iter().flat_map(unit).collect()
+            },
+        )
+    }
+    /// (N,) float32 in (0, 1).
+    #[getter]
+    fn opacities<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        Self::kept(
+            this,
+            |s| &s.opacities,
+            &[],
+            |live| live.splats().opacity_logits.iter().map(|v| 1.0 / (1.0 + (-v).exp())).collect(),
+        )
+    }
+    /// (N,) bool; False where no photo shows the splat and it is a guess. All True for a file of
+    /// Gaussians, of which nothing is known.
+    #[getter]
+    fn seen<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        Self::kept(
+            this,
+            |s| &s.seen,
+            &[],
+            |live| (0..live.splats().len()).map(|i| !live.seen().is_unseen(i)).collect(),
+        )
+    }
+    /// Degree of the spherical harmonics, 0 to 3.
+    #[getter]
+    fn sh_degree(&self) -> u32 {
+        self.live().splats().sh_degree
+    }
+    /// Whether the splats are meant with the 2-D Mip filter (gsplat: `rasterize_mode="antialiased"`).
+    #[getter]
+    fn antialiased(&self) -> bool {
+        self.live().splats().antialiased
+    }
+    /// Cameras of the photos, at working size; empty for a file of Gaussians.
+    #[getter]
+    fn cameras(&self) -> Vec<Camera> {
+        self.live().cameras().iter().cloned().map(Camera).collect()
+    }
+    /// (3,) float64, unit vector against gravity; None where it is not known.
+    #[getter]
+    fn up(&self, py: Python<'_>) -> PyResult<Option<Py<PyAny>>> {
+        let up = self.live().world().up.as_ref().map(|up| up.direction.to_array().to_vec());
+        up.map(|up| arrays::owned(py, up, &[3])).transpose()
+    }
+    /// Metres per unit of the scene; None where no length was stated.
+    #[getter]
+    fn metres_per_unit(&self) -> Option<f64> {
+        self.live().world().scale.as_ref().map(|s| s.metres_per_unit)
+    }
+    /// Warnings of the run that made the scene, or of reading its file.
+    #[getter]
+    fn warnings(&self) -> Vec<String> {
+        self.live().warnings().to_vec()
+    }
+    /// Whether texts can be asked.
+    #[getter]
+    fn has_language(&self) -> bool {
+        self.live().language().is_some_and(|field| field.levels.iter().any(|l| !l.codebook.is_empty()))
+    }
+    /// Where the scene is stored; None if it is not.
+    #[getter]
+    pub fn path(&self) -> Option<PathBuf> {
+        self.path.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+    fn __len__(&self) -> usize {
+        self.live().splats().len()
+    }
+    fn __repr__(&self) -> String {
+        let live = self.live();
+        let place = self.path().map(|p| format!(" of {}", p.display())).unwrap_or_default();
+        format!("<splatvk.Scene{place}: {} splats, {} cameras>", live.splats().len(), live.cameras().len())
+    }
+    /// Answers a text. `camera` is the view of the answer's mask and heat; the first of the scene
+    /// without it.
+    #[pyo3(signature = (text, camera = None))]
+    fn query(this: &Bound<'_, Self>, text: &str, camera: Option<&Bound<'_, PyAny>>) -> PyResult<Answer> {
+        let py = this.py();
+        let camera = this.get().camera(py, camera)?;
+        let answers = this.get().on_device(py, |live| live.ask(text, &camera))?;
+        Ok(Answer::new(this.clone().unbind(), camera, answers))
+    }
+    /// Renders a view: a dict of "rgb" (H, W, 3), "alpha" (H, W) and "depth" (H, W; scene units, 0
+    /// where alpha is below ½), float32, on black.
+    #[pyo3(signature = (camera = None, channels = None))]
+    fn render<'py>(
+        &self,
+        py: Python<'py>,
+        camera: Option<&Bound<'py, PyAny>>,
+        channels: Option<Vec<String>>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let camera = self.camera(py, camera)?;
+        let frame = self.on_device(py, |live| live.view(&camera))?.rendered;
+        let (h, w) = (camera.height as usize, camera.width as usize);
+        let views = PyDict::new(py);
+        for channel in channels.unwrap_or_else(|| vec!["rgb".to_owned()]) {
+            let array = match channel.as_str() {
+                "rgb" => arrays::owned(py, frame.rgb.data.as_flattened().to_vec(), &[h, w, 3])?,
+                "alpha" => arrays::owned(py, frame.alpha.data.clone(), &[h, w])?,
+                "depth" => arrays::owned(py, frame.depth.data.clone(), &[h, w])?,
+                other => {
+                    let text = format!("there is no channel {other:?}; there are rgb, alpha and depth");
+                    return Err(errors::named(py, "InputError", text));
+                }
+            };
+            views.set_item(channel, array)?;
+        }
+        Ok(views)
+    }
+    /// The splats of a mask (N,) bool or of indices as a scene of their own, with the cameras and the
+    /// language of this one.
+    fn __getitem__(&self, py: Python<'_>, rows: &Bound<'_, PyAny>) -> PyResult<Scene> {
+        let count = self.live().splats().len();
+        let rows: Vec<usize> = if let Ok(mask) = rows.extract::<PyReadonlyArray1<'_, bool>>() {
+            if mask.len()? != count {
+                return Err(PyIndexError::new_err(format!(
+                    "the mask has {} rows, the scene {count}",
+                    mask.len()?
+                )));
+            }
+            mask.as_array().iter().enumerate().filter(|(_, keep)| **keep).map(|(i, _)| i).collect()
+        } else {
+            rows.extract::<Vec<usize>>()?
+        };
+        if let Some(row) = rows.iter().find(|row| **row >= count) {
+            return Err(PyIndexError::new_err(format!("there is no splat {row}; the scene has {count}")));
+        }
+        Ok(Scene::of(self.on_device(py, |live| live.picked(&rows))?, None))
+    }
+    /// Writes a file of Gaussians in the format of its ending (.ply, .spz, .glb, ...), or a scene
+    /// directory where there is no ending. Existing ones are replaced only with `force`.
+    #[pyo3(signature = (path, force = false))]
+    fn save(&self, py: Python<'_>, path: PathBuf, force: bool) -> PyResult<()> {
+        self.on_device(py, |live| live.save(&path, force))?;
+        if path.is_dir() {
+            *self.path.lock().unwrap_or_else(PoisonError::into_inner) = Some(path);
+        }
+        Ok(())
+    }
+    /// The arguments of gsplat's `rasterization`: a dict of means, quats, scales, opacities, colors
+    /// (spherical harmonics), sh_degree, rasterize_mode, and viewmats, Ks, width, height of the
+    /// scene's cameras; NumPy arrays, for `torch.from_numpy`.
+    fn to_gsplat<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        converted(this, "to_gsplat")
+    }
+    /// A `trimesh.PointCloud` of the centres with their colours.
+    fn to_trimesh<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        converted(this, "to_trimesh")
+    }
+    /// A `pycolmap.Reconstruction` of cameras and points; the scene has to be stored.
+    fn to_pycolmap<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        converted(this, "to_pycolmap")
+    }
+    fn __reduce__(&self, py: Python<'_>) -> PyResult<(Py<PyAny>, (PathBuf,))> {
+        match self.path() {
+            Some(path) => Ok((py.import("splatvk")?.getattr("load")?.unbind(), (path,))),
+            None => Err(errors::named(
+                py,
+                "InputError",
+                "the scene is not stored anywhere, so it cannot be pickled; save it first".to_owned(),
+            )),
+        }
+    }
+}
+
+/// The scene in the types of another package, by a function of `splatvk._convert`.
+fn converted<'py>(scene: &Bound<'py, Scene>, function: &str) -> PyResult<Bound<'py, PyAny>> {
+    scene.py().import("splatvk._convert")?.call_method1(function, (scene,))
+}
+
+/// Loads a scene directory or a file of Gaussians.
+#[pyfunction]
+#[pyo3(signature = (path, device = None, models = None))]
+pub fn load(py: Python<'_>, path: PathBuf, device: Option<&str>, models: Option<PathBuf>) -> PyResult<Scene> {
+    let device = device::device(py, device)?;
+    let live = work::unobserved(py, || LiveScene::load(&device, &path, &Registry::open(models.as_deref())?))?;
+    Ok(Scene::of(live, Some(std::path::absolute(&path)?)))
+}
+
+/// Options of [`reconstruct`] with their defaults, as JSON.
+#[pyfunction]
+pub fn options(py: Python<'_>) -> PyResult<String> {
+    let plan = serde_json::to_string(&RunPlan::default()).map_err(|e| Error::work(e.to_string()));
+    plan.map_err(|e| errors::exception(py, &e))
+}
+
+/// Makes a scene from photos: `plan` is a `RunPlan` as JSON.
+#[pyfunction]
+pub fn reconstruct(py: Python<'_>, plan: &str, observer: Py<PyAny>) -> PyResult<Scene> {
+    let plan = read_plan(plan).map_err(|e| errors::exception(py, &e))?;
+    let device = device::device(py, plan.machine.device.as_deref())?;
+    let live = work::observed(py, &observer, |progress| {
+        let outcome = run::run(&plan, progress)?;
+        LiveScene::trained(&device, outcome, &plan.machine.registry()?)
+    })?;
+    Ok(Scene::of(live, Some(std::path::absolute(&plan.output.out)?)))
+}
+
+/// Reads a plan and names its sources; keys that no plan has are refused.
+fn read_plan(text: &str) -> Result<RunPlan> {
+    let wrong = |e: serde_json::Error| Error::input(format!("options: {e}"));
+    let given: Value = serde_json::from_str(text).map_err(wrong)?;
+    let known = serde_json::to_value(RunPlan::default()).map_err(wrong)?;
+    let has = |key: &String| known.get(key).is_some();
+    if let Some(key) = given.as_object().and_then(|keys| keys.keys().find(|key| !has(key))) {
+        return Err(Error::input(format!("there is no option {key}; help(splatvk.reconstruct) lists them")));
+    }
+    let plan: RunPlan = serde_json::from_value(given).map_err(wrong)?;
+    let config = plan.config.resolved(&inventory(&plan.machine.registry()?))?;
+    Ok(RunPlan { config, ..plan })
+}
