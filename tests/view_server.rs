@@ -311,9 +311,15 @@ fn view_of_running_run_is_a_preview() {
     let server = Server::start(&out);
     assert!(!out.exists(), "the scene comes later");
     let (status, page) = server.request("GET", "", "", "");
-    assert!(status == 200 && page.contains("A preview: the scene is still being made"), "{status}");
+    assert!(status == 200 && page.contains("\"renews\":true"), "{status}");
     drop(run);
     assert_eq!(server.request("GET", "scene.bin", "", "").0, 200, "the preview stays in memory");
+    let told = || server.request("GET", "state", "", "").1.contains("ended without a scene");
+    let begun = std::time::Instant::now();
+    while !told() {
+        assert!(begun.elapsed() < Duration::from_secs(30), "the page is told that the run ended");
+        std::thread::sleep(Duration::from_millis(100));
+    }
     // A stopped run has no preview: the next command says that there is no scene.
     let view = Command::new(env!("CARGO_BIN_EXE_splatvk")).arg("view").arg(&out).output().unwrap();
     assert_eq!(view.status.code(), Some(2));

@@ -356,6 +356,7 @@ fn static_page_answers_stored_queries() {
         language: scene.language.as_ref(),
         names: &names,
         answers: answers.iter().map(|a| a.shown()).collect(),
+        suggested: Vec::new(),
     };
     let (section, note) = view.embedded().unwrap();
     println!("{note}");

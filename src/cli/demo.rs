@@ -22,12 +22,12 @@ const PHOTOS: [(&str, &[u8]); 4] = [
     ("table_4.jpg", include_bytes!("../../tests/data/breakfast/images/train_03.jpg")),
 ];
 /// Three things on the table, and one that is not there.
-const QUERIES: [&str; 4] = ["lemon", "milk carton", "bread", "teapot"];
+const QUERIES: [&str; 4] = ["lemon", "loaf of bread", "blue mug", "green apple"];
 
 /// Longer side of the working images on a CPU device, pixels: a quarter of the work of the photos'.
 const CPU_SIZE: usize = 320;
 /// Training steps on a CPU device.
-const CPU_STEPS: usize = 200;
+const CPU_STEPS: usize = 120;
 /// Seconds on a CPU device with one core.
 const CPU_CORE_SECONDS: f64 = 150.0;
 /// Seconds on a GPU: an H200 takes less, an integrated one more.
@@ -136,7 +136,7 @@ fn make(args: &DemoArgs, plan: &RunPlan) -> Result<()> {
     }
     let mut text = format!("Done in {}.\n", duration(outcome.seconds));
     for answer in outcome.language.iter().flat_map(|l| &l.answers) {
-        text += &format!("  {:12} {}\n", answer.text, answer.verdict());
+        text += &format!("  {:15} {}\n", answer.text, answer.verdict());
     }
     if args.no_open {
         text += &format!("Look around:     splatvk view {}\n", shell_quoted(&plan.output.out));

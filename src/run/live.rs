@@ -19,6 +19,7 @@ use crate::photo;
 use crate::progress::Silent;
 use crate::query::QueryOptions;
 use crate::query::phrasing::Reading;
+use crate::report::viewer::{CodeNames, Scene3d};
 use crate::scene::{Camera, LanguageField, Seen, Splats, World};
 use crate::{Error, Result};
 use std::path::Path;
@@ -200,6 +201,34 @@ impl LiveScene {
         scene.world = self.world().clone();
         scene.language = self.language().map(|field| field.clone().picked(rows, count));
         LiveScene::new(&self.device, SceneOrigin::Loaded(Box::new(scene)), &self.registry)
+    }
+
+    /// The interactive view as a whole page with at most `most` splats, for a frame in another
+    /// page ([`Scene3d::framed`]).
+    pub fn page(&self, title: &str, most: usize, asks: bool) -> Result<String> {
+        let none = CodeNames::new();
+        let backdrop = match &self.origin {
+            SceneOrigin::Trained(o) => &o.backdrop,
+            SceneOrigin::Loaded(s) => &s.backdrop,
+        };
+        let names = match &self.origin {
+            SceneOrigin::Trained(o) => o.language.as_ref().map_or(&none, |l| &l.names),
+            SceneOrigin::Loaded(_) => &none,
+        };
+        let scene = Scene3d {
+            title,
+            splats: self.splats(),
+            seen: self.seen(),
+            backdrop,
+            cameras: self.cameras(),
+            world: self.world(),
+            photos: Vec::new(),
+            language: self.language(),
+            names,
+            answers: Vec::new(),
+            suggested: Vec::new(),
+        };
+        scene.framed(most, asks)
     }
 
     /// Answers a text for the scene and for one view.

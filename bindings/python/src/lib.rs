@@ -19,7 +19,7 @@ mod _splatvk {
     #[pymodule_export]
     use crate::device::{close_device, device_name};
     #[pymodule_export]
-    use crate::scene::{Scene, load, options, reconstruct};
+    use crate::scene::{Scene, load, options, reconstruct, reconstruct_pixels};
     #[pymodule_export]
     use crate::work::Event;
     use pyo3::prelude::*;

@@ -3,15 +3,17 @@ use crate::answer::Answer;
 use crate::camera::Camera;
 use crate::device::{self, Process};
 use crate::{arrays, errors, work};
-use numpy::{Element, PyReadonlyArray1};
+use numpy::{Element, PyReadonlyArray1, PyReadonlyArray3};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::{Map, Value};
 use splatvk::infer::Registry;
-use splatvk::infer::installed::inventory;
+use splatvk::photo;
+use splatvk::query::instances::splat_codes;
 use splatvk::run::live::LiveScene;
-use splatvk::run::{self, RunPlan};
+use splatvk::run::{self, Extras, RunPlan};
+use splatvk::scene::{LEVEL_NAMES, RgbImage};
 use splatvk::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
@@ -28,6 +30,7 @@ pub struct Scene {
     quats: OnceLock<Vec<f32>>,
     opacities: OnceLock<Vec<f32>>,
     seen: OnceLock<Vec<bool>>,
+    codes: OnceLock<Vec<i32>>,
 }
 
 impl Scene {
@@ -40,6 +43,7 @@ impl Scene {
             quats: OnceLock::new(),
             opacities: OnceLock::new(),
             seen: OnceLock::new(),
+            codes: OnceLock::new(),
         }
     }
 
@@ -175,6 +179,24 @@ impl Scene {
             |live| (0..live.splats().len()).map(|i| !live.seen().is_unseen(i)).collect(),
         )
     }
+    /// (N, 3) int32, the code of each splat as a subpart, a part and a thing (levels "s", "m", "l");
+    /// -1 without one.
+    #[getter]
+    fn codes<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        Self::kept(this, |s| &s.codes, &[LEVEL_NAMES.len()], |live| {
+            let mut codes = vec![-1; live.splats().len() * LEVEL_NAMES.len()];
+            let levels = live.language().map_or(&[][..], |field| &field.levels);
+            for (at, level) in levels.iter().enumerate() {
+                for (splat, code) in splat_codes(level).into_iter().enumerate() {
+                    let place = codes.get_mut(splat * LEVEL_NAMES.len() + at);
+                    if let (Some(place), Some(Ok(code))) = (place, code.map(i32::try_from)) {
+                        *place = code;
+                    }
+                }
+            }
+            codes
+        })
+    }
     /// Degree of the spherical harmonics, 0 to 3.
     #[getter]
     fn sh_degree(&self) -> u32 {
@@ -234,7 +256,8 @@ impl Scene {
         Ok(Answer::new(this.clone().unbind(), camera, answers))
     }
     /// Renders a view: a dict of "rgb" (H, W, 3), "alpha" (H, W) and "depth" (H, W; scene units, 0
-    /// where alpha is below ½), float32, on black.
+    /// where alpha is below ½), float32, on black; "codes" (3, H, W) int32, the codes of the levels
+    /// "s", "m" and "l", -1 without one.
     #[pyo3(signature = (camera = None, channels = None))]
     fn render<'py>(
         &self,
@@ -243,7 +266,8 @@ impl Scene {
         channels: Option<Vec<String>>,
     ) -> PyResult<Bound<'py, PyDict>> {
         let camera = self.camera(py, camera)?;
-        let frame = self.on_device(py, |live| live.view(&camera))?.rendered;
+        let view = self.on_device(py, |live| live.view(&camera))?;
+        let frame = view.rendered;
         let (h, w) = (camera.height as usize, camera.width as usize);
         let views = PyDict::new(py);
         for channel in channels.unwrap_or_else(|| vec!["rgb".to_owned()]) {
@@ -251,8 +275,12 @@ impl Scene {
                 "rgb" => arrays::owned(py, frame.rgb.data.as_flattened().to_vec(), &[h, w, 3])?,
                 "alpha" => arrays::owned(py, frame.alpha.data.clone(), &[h, w])?,
                 "depth" => arrays::owned(py, frame.depth.data.clone(), &[h, w])?,
+                "codes" => {
+                    let planes = view.codes.iter().flat_map(|level| level.data.iter().copied()).collect();
+                    arrays::owned(py, planes, &[view.codes.len(), h, w])?
+                }
                 other => {
-                    let text = format!("there is no channel {other:?}; there are rgb, alpha and depth");
+                    let text = format!("there is no channel {other:?}; there are rgb, alpha, depth and codes");
                     return Err(errors::named(py, "InputError", text));
                 }
             };
@@ -299,6 +327,31 @@ impl Scene {
     /// A `trimesh.PointCloud` of the centres with their colours.
     fn to_trimesh<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         converted(this, "to_trimesh")
+    }
+    /// Logs splats, cameras and boxes of things to a Rerun recording: `rerun.init(...)` first.
+    fn to_rerun<'py>(this: &Bound<'py, Self>, path: Option<&str>) -> PyResult<Bound<'py, PyAny>> {
+        this.py().import("splatvk._convert")?.call_method1("to_rerun", (this, path.unwrap_or("scene")))
+    }
+    /// The interactive view in a notebook, with questions and a selection that comes back:
+    /// `widget.mask` selects splats of the scene. Needs `pip install splatvk[notebook]`.
+    #[pyo3(signature = (height = 480))]
+    fn widget<'py>(this: &Bound<'py, Self>, height: usize) -> PyResult<Bound<'py, PyAny>> {
+        this.py().import("splatvk._widget")?.call_method1("make", (this, height))
+    }
+    /// The page of the interactive view with at most `most` splats; with `asks` it sends questions
+    /// to the page around it.
+    fn _page(&self, py: Python<'_>, most: usize, asks: bool) -> PyResult<String> {
+        let title = self.path().and_then(|p| Some(p.file_stem()?.to_string_lossy().into_owned()));
+        work::unobserved(py, || self.live().page(title.as_deref().unwrap_or("scene"), most, asks))
+    }
+    /// The answer to a text as JSON for that page.
+    fn _ask(this: &Bound<'_, Self>, text: &str) -> PyResult<String> {
+        let py = this.py();
+        let camera = this.get().camera(py, None)?;
+        this.get().on_device(py, |live| Ok(live.ask(text, &camera)?.shown().json().to_string()))
+    }
+    fn _repr_html_<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        this.py().import("splatvk._widget")?.call_method1("html", (this,))
     }
     /// A `pycolmap.Reconstruction` of cameras and points; the scene has to be stored.
     fn to_pycolmap<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
@@ -347,6 +400,45 @@ pub fn reconstruct(py: Python<'_>, plan: &str, observer: Py<PyAny>) -> PyResult<
         LiveScene::trained(&device, outcome, &plan.machine.registry()?)
     })?;
     Ok(Scene::of(live, Some(std::path::absolute(&plan.output.out)?)))
+}
+
+/// Makes a scene from pixels: `photos` are names and arrays (H, W, 3), float32 in [0, 1], sRGB. The
+/// scene is stored where the plan has a place.
+#[pyfunction]
+pub fn reconstruct_pixels(
+    py: Python<'_>,
+    plan: &str,
+    photos: Vec<(String, PyReadonlyArray3<'_, f32>)>,
+    observer: Py<PyAny>,
+) -> PyResult<Scene> {
+    let plan = read_plan(plan).map_err(|e| errors::exception(py, &e))?;
+    let device = device::device(py, plan.machine.device.as_deref())?;
+    let default = photo::default_max_size(device.info().is_cpu);
+    let max_size = plan.config.training.max_size.unwrap_or(default);
+    let mut read = Vec::with_capacity(photos.len());
+    for (name, array) in &photos {
+        let array = array.as_array();
+        let (height, width, channels) = array.dim();
+        if channels != 3 {
+            return Err(errors::named(py, "InputError", format!("{name}: (H, W, 3) is needed, not {:?}", array.shape())));
+        }
+        let values: Vec<f32> = array.iter().copied().collect();
+        let image = RgbImage { width, height, data: values.as_chunks::<3>().0.to_vec() };
+        let photo = photo::from_pixels(Path::new(name), &image, None, max_size);
+        read.push(photo.map_err(|e| errors::exception(py, &e))?);
+    }
+    let out = &plan.output.out;
+    let live = work::observed(py, &observer, |progress| {
+        let registry = plan.machine.registry()?;
+        let extras = Extras { queries: plan.inputs.queries.clone(), ..Extras::default() };
+        let mut outcome = run::reconstruct(&plan.config, &extras, &device, &registry, read, progress)?;
+        if !out.as_os_str().is_empty() {
+            run::save(&mut outcome, out, plan.output.force, progress)?;
+        }
+        LiveScene::trained(&device, outcome, &registry)
+    })?;
+    let path = (!out.as_os_str().is_empty()).then(|| std::path::absolute(out)).transpose()?;
+    Ok(Scene::of(live, path))
 }
 
 /// Reads a plan and names its sources; keys that no plan has are refused.

@@ -27,9 +27,10 @@ const REPORT_SPLATS: usize = 300_000;
 const THUMBNAIL: usize = 104;
 
 /// Import name and text of each module.
-const MODULES: [(&str, &str); 12] = [
+const MODULES: [(&str, &str); 13] = [
     ("splatvk/camera", include_str!("camera.js")),
     ("splatvk/controls", include_str!("controls.js")),
+    ("splatvk/frame", include_str!("frame.js")),
     ("splatvk/measure", include_str!("measure.js")),
     ("splatvk/motion", include_str!("motion.js")),
     ("splatvk/names", include_str!("names.js")),
@@ -134,6 +135,18 @@ impl Scene3d<'_> {
         Ok((section(&manifest, &splats), note))
     }
 
+    /// Whole page with at most `most` splats inside, for a frame in another page; with `asks` it
+    /// sends questions to that page, which answers them.
+    pub fn framed(&self, most: usize, asks: bool) -> Result<String> {
+        let packed = pack(self.splats, self.seen, self.backdrop, self.language, most)?;
+        let mut manifest = self.manifest("This view answers no questions; ask in Python: scene.query(text).")?;
+        manifest["live"] = asks.into();
+        manifest["framed"] = true.into();
+        let data = STANDARD.encode(&packed.bytes);
+        let splats = format!("<script type=\"text/plain\" id=\"v-splats\">{data}</script>");
+        Ok(self.whole_page(&manifest, &splats))
+    }
+
     /// Whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `no_questions` is
     /// the reason why it cannot answer, if any. A preview follows `GET state`.
     pub fn served(&self, no_questions: Option<&str>, lifetime: Lifetime) -> Result<String> {
@@ -141,14 +154,18 @@ impl Scene3d<'_> {
         manifest["live"] = no_questions.is_none().into();
         manifest["scene"] = SCENE_PATH.into();
         manifest["renews"] = (lifetime == Lifetime::Preview).into();
+        Ok(self.whole_page(&manifest, ""))
+    }
+
+    fn whole_page(&self, manifest: &Value, splats: &str) -> String {
         let title = super::chart::escape(self.title);
-        Ok(format!(
+        format!(
             "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" \
              content=\"width=device-width, initial-scale=1, viewport-fit=cover\"><title>{title} · splatvk</title>\
              <link rel=\"icon\" href=\"data:,\"><style>* {{ box-sizing: border-box }} body {{ margin: 0; background: #000 }}\
              {STYLE}</style><body>{}</html>\n",
-            section(&manifest, "").replacen("class=\"viewer\"", "class=\"viewer full\"", 1)
-        ))
+            section(manifest, splats).replacen("class=\"viewer\"", "class=\"viewer full\"", 1)
+        )
     }
 
     fn manifest(&self, ask_note: &str) -> Result<Value> {
@@ -258,6 +275,8 @@ mod tests {
         assert!(page.contains("viewer full") && page.contains("a&lt;b") && !page.contains("v-splats\""));
         assert!(page.contains("\"ask_note\":\"no model\"") && page.contains("\"live\":false"));
         assert!(page.contains("\"renews\":true") && page.contains("\"suggested\":[\"mug\"]"));
+        let framed = scene.framed(10, true).unwrap();
+        assert!(framed.contains("id=\"v-splats\"") && framed.contains("\"framed\":true"));
         let last = scene.served(None, Lifetime::Final).unwrap();
         assert!(last.contains("\"live\":true") && last.contains("\"renews\":false"));
         // Every imported module exists.

@@ -6,6 +6,7 @@ import { Tape, lengthText } from "splatvk/measure";
 import { MOST, Motion, Pace, firstCamera } from "splatvk/motion";
 import { isClear, namesOf, perhaps } from "splatvk/names";
 import { pick } from "splatvk/pick";
+import { askOuter, tellOuter } from "splatvk/frame";
 import { follow, kept } from "splatvk/preview";
 import { Renderer } from "splatvk/render";
 import { download, extentOf, gunzip, medianDepth, unpack } from "splatvk/splats";
@@ -235,6 +236,7 @@ function select(level, picked) {
   // A selection is highlighted in colour and on its level; depth and relevancy would hide it.
   if (state.mode !== "level") state.mode = "colour";
   renderer.select(level, [code]);
+  if (manifest.framed) tellOuter({ selected: { level, codes: [code] } });
   show(state.mode, level);
   const names = namesOf(levels, answers, level, code), size = `${sizeOf(level, code).toLocaleString("en")} splats`;
   const { one } = levels[level], asked = answers.find((a) => isSure(a) && a.level === level && a.codes.includes(code));
@@ -310,6 +312,7 @@ function legend() {
 }
 
 function clear() {
+  if (manifest.framed) tellOuter({ selected: null });
   state.selected = state.picked = null;
   renderer.select(-1, []);
   find(".v-card").hidden = true;
@@ -332,9 +335,8 @@ async function ask(text) {
     if (!manifest.live) return say(manifest.ask_note);
     say("Looking …");
     try {
-      const reply = await fetch("query", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ text }) });
-      const body = await reply.json();
-      if (!reply.ok) return say(body.error);
+      const { ok, body } = manifest.framed ? await askOuter(text) : await askServer(text);
+      if (!ok) return say(body.error);
       answer = body;
     } catch {
       return say("The server does not answer; is splatvk view still running?");
@@ -346,7 +348,13 @@ async function ask(text) {
   state.selected = state.picked = null;
   renderer.select(-1, []);
   setQuery(answer);
+  if (manifest.framed) tellOuter({ selected: { level: answer.level, codes: answer.codes }, text: answer.text });
   show("relevancy");
+}
+
+async function askServer(text) {
+  const reply = await fetch("query", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ text }) });
+  return { ok: reply.ok, body: await reply.json() };
 }
 
 /// Whether an answer says that the thing is there.

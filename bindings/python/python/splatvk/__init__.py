@@ -18,7 +18,7 @@ from . import _parts
 
 _parts.find()
 
-from . import _progress, _splatvk  # noqa: E402  the module loads what _parts has found
+from . import _photos, _progress, _splatvk  # noqa: E402  the module loads what _parts has found
 from ._splatvk import (  # noqa: E402
     Answer,
     Camera,
@@ -78,15 +78,17 @@ __all__ = [
 _SOURCES = ("init", "depth_prior", "matcher", "masks", "features")
 
 
-def reconstruct(photos, *, out, views=None, queries=(), language=True, progress=False, **options):
+def reconstruct(photos, *, out=None, views=None, queries=(), language=True, progress=False, **options):
     """Makes a scene from photos, and stores it in the folder `out`.
 
     Parameters
     ----------
-    photos : path or sequence of paths
-        Photos, folders of photos, or a video.
+    photos : path, sequence of paths, or sequence of arrays
+        Photos, folders of photos, or a video; or 2 to 16 arrays (H, W, 3) of sRGB pixels, uint8, or
+        float32 in [0, 1].
     out : path
-        The scene directory. It is written whole or not at all; `force=True` replaces a scene.
+        The scene directory. It is written whole or not at all; `force=True` replaces a scene. Only
+        a scene from arrays may go without; `scene.save` stores it.
     views : int, optional
         How many of the photos are used; without it all, at most 4.
     queries : sequence of str
@@ -113,9 +115,12 @@ def reconstruct(photos, *, out, views=None, queries=(), language=True, progress=
         `resume=True` continues.
     """
     paths = [photos] if isinstance(photos, (str, _os.PathLike)) else list(photos)
+    arrays = _photos.arrays(paths)
+    if out is None and arrays is None:
+        raise InputError("photos from files need a place for the scene: out=")
     plan = {
-        "inputs": [_os.fspath(path) for path in paths],
-        "out": _os.fspath(out),
+        "inputs": [] if arrays is not None else [_os.fspath(path) for path in paths],
+        "out": "" if out is None else _os.fspath(out),
         "queries": list(queries),
         "views": views,
         **dict.fromkeys(_SOURCES, "auto"),
@@ -126,7 +131,12 @@ def reconstruct(photos, *, out, views=None, queries=(), language=True, progress=
     for key, value in plan.items():
         if isinstance(value, _os.PathLike):
             plan[key] = _os.fspath(value)
-    return _splatvk.reconstruct(_json.dumps(plan), _progress.observer(progress))
+    if arrays is None:
+        return _splatvk.reconstruct(_json.dumps(plan), _progress.observer(progress))
+    refused = [key for key in ("views", "photo_masks", "points", "resume", "add") if plan.get(key)]
+    if refused:
+        raise InputError(f"{refused[0]} needs photos from files")
+    return _splatvk.reconstruct_pixels(_json.dumps(plan), arrays, _progress.observer(progress))
 
 
 def train(images, cameras, *, out, views=None, progress=False, **options):

@@ -25,6 +25,40 @@ def to_gsplat(scene):
     return arguments
 
 
+def to_rerun(scene, path):
+    """Logs a scene to the recording of `rerun`: Gaussians where the package has them, else points."""
+    import rerun as rr
+
+    colours = np.clip(0.5 + _SH_C0 * scene.sh[:, 0], 0, 1)
+    if scene.up is not None:
+        # The data stay in scene axes; this turns the first view of Rerun.
+        axis = int(np.argmax(np.abs(scene.up)))
+        name = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if scene.up[axis] > 0 else 'DOWN'}"
+        rr.log(path, getattr(rr.ViewCoordinates, name), static=True)
+    if hasattr(rr, "GaussianSplats3D"):
+        splats = rr.GaussianSplats3D(
+            centers=scene.means,
+            scales=scene.scales,
+            quaternions=scene.quats[:, [1, 2, 3, 0]],
+            opacities=scene.opacities,
+            colors=colours,
+        )
+    else:
+        rgba = np.concatenate([colours, scene.opacities[:, None]], axis=1)
+        splats = rr.Points3D(scene.means, colors=rgba, radii=scene.scales.max(axis=1))
+    rr.log(f"{path}/splats", splats, static=True)
+    for camera in scene.cameras:
+        place = f"{path}/cameras/{camera.name.rsplit('.', 1)[0]}"
+        rotation = camera.w2c[:3, :3].T
+        rr.log(place, rr.Transform3D(translation=camera.center, mat3x3=rotation), static=True)
+        pinhole = rr.Pinhole(
+            image_from_camera=camera.K,
+            resolution=[camera.width, camera.height],
+            camera_xyz=rr.ViewCoordinates.RDF,
+        )
+        rr.log(place, pinhole, static=True)
+
+
 def to_trimesh(scene):
     """The centres of the splats with their colours, a `trimesh.PointCloud`."""
     import trimesh
