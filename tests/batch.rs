@@ -1,6 +1,6 @@
 //! `splatvk batch`: with a stand-in for the rows, and with whole scenes.
 #![cfg(target_os = "linux")]
-#![allow(clippy::unwrap_used)] // a panic is how a test fails
+#![allow(clippy::unwrap_used, clippy::panic)] // a panic is how a test fails
 mod fixture;
 
 use fixture::command::{refuses, splatvk, text};

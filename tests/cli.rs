@@ -24,10 +24,15 @@ fn names(folder: &Path) -> Vec<String> {
 
 /// Expects that `splatvk run INPUT... --out FOLDER/out/scene` is refused and FOLDER stays empty.
 fn run_refuses(inputs: &[&Path], options: &[&str], words: &[&str]) {
+    run_ends(2, inputs, options, words);
+}
+
+/// A run that ends with an exit code before it leaves anything.
+fn run_ends(code: i32, inputs: &[&Path], options: &[&str], words: &[&str]) {
     let folder = tempfile::tempdir().unwrap();
     let mut command = splatvk();
     command.arg("run").args(inputs).args(options).arg("--out").arg(folder.path().join("out/scene"));
-    refuses(&mut command, 2, words);
+    refuses(&mut command, code, words);
     assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
 }
 
@@ -43,7 +48,7 @@ fn unusable_photos_are_refused() {
     // Without ffmpeg.
     let mut command = splatvk();
     command.env("PATH", dir).arg("run").arg(dir.join("clip.mp4")).arg("--out").arg(dir.join("scene"));
-    refuses(&mut command, 2, &["clip.mp4", "ffprobe", "install"]);
+    refuses(&mut command, 3, &["clip.mp4", "ffprobe", "install"]);
     assert_eq!(names(dir), ["clip.mp4"]);
     let photo = |i: usize| data(&format!("breakfast/images/train_{i:02}.jpg"));
     std::fs::copy(photo(0), dir.join("a.jpg")).unwrap();
@@ -67,7 +72,7 @@ fn heic_without_library_explains_installation() {
     command.env("SPLATVK_LIBHEIF", folder.path().join("libheif.so.1"));
     command.arg("run").args([photo("photos/turned.heic"), photo("breakfast/images/train_00.jpg")]);
     command.arg("--out").arg(folder.path().join("scene"));
-    refuses(&mut command, 2, &["turned.heic", "libheif", "SPLATVK_LIBHEIF"]);
+    refuses(&mut command, 3, &["turned.heic", "libheif", "SPLATVK_LIBHEIF"]);
     assert!(names(folder.path()).is_empty(), "left behind: {:?}", names(folder.path()));
     let mut doctor = splatvk();
     let output = doctor.arg("doctor").env("SPLATVK_LIBHEIF", "/nowhere/libheif.so").output().unwrap();
@@ -246,21 +251,21 @@ fn ask(scene: &Path, current: &Path, more: &[&str]) -> String {
 fn unwritable_output_fails_before_work() {
     let folder = tempfile::tempdir().unwrap();
     let photos = data("breakfast/images");
-    let run = |out: PathBuf, words: &[&str]| {
+    let run = |out: PathBuf, code: i32, words: &[&str]| {
         let start = Instant::now();
-        refuses(splatvk().arg("run").arg(&photos).arg("--out").arg(out), 2, words);
+        refuses(splatvk().arg("run").arg(&photos).arg("--out").arg(out), code, words);
         assert!(start.elapsed() < Duration::from_secs(5), "the work must not start");
     };
     let file = folder.path().join("file");
     std::fs::write(&file, "x").unwrap();
-    run(file.clone(), &["file is in the way"]);
-    run(file.join("scene"), &["cannot be written"]);
-    run(PathBuf::from("/proc/splatvk-scene"), &["cannot be written"]);
+    run(file.clone(), 2, &["file is in the way"]);
+    run(file.join("scene"), 2, &["cannot be written"]);
+    run(PathBuf::from("/proc/splatvk-scene"), 2, &["cannot be written"]);
     let precious = folder.path().join("precious");
     std::fs::create_dir(&precious).unwrap();
     std::fs::write(precious.join("letter.txt"), "x").unwrap();
-    run(precious.clone(), &["not empty"]);
-    run(scene().to_path_buf(), &["already holds a scene", "--force"]);
+    run(precious.clone(), 2, &["not empty"]);
+    run(scene().to_path_buf(), 2, &["already holds a scene", "--force"]);
     let mut force = splatvk();
     force.arg("run").arg(&photos).arg("--force").arg("--out").arg(&precious);
     refuses(&mut force, 2, &["not a scene"]);
@@ -274,7 +279,7 @@ fn bad_model_error_names_checksum() {
     let models = folder.path().join("models");
     std::fs::create_dir(&models).unwrap();
     let photos = data("breakfast/images");
-    run_refuses(&[&photos], &["--models", models.to_str().unwrap()], &["sha256", "tools/"]);
+    run_ends(3, &[&photos], &["--models", models.to_str().unwrap()], &["sha256", "tools/"]);
     let listed = splatvk().args(["models", "list", "--json", "--models"]).arg(&models).output().unwrap();
     assert!(listed.status.success());
     let list: serde_json::Value = serde_json::from_slice(&listed.stdout).unwrap();
@@ -286,10 +291,10 @@ fn bad_model_error_names_checksum() {
     for m in list {
         std::fs::write(m["file"].as_str().unwrap(), b"damaged").unwrap();
     }
-    run_refuses(&[&photos], &["--models", models.to_str().unwrap()], &["sha256", "tools/"]);
+    run_ends(3, &[&photos], &["--models", models.to_str().unwrap()], &["sha256", "tools/"]);
     let mut check = splatvk();
     check.args(["models", "check", "--models"]).arg(&models);
-    refuses(&mut check, 2, &["sha256"]);
+    refuses(&mut check, 3, &["sha256"]);
     run_refuses(&[&photos], &["--models", folder.path().join("none").to_str().unwrap()], &["none"]);
 }
 
@@ -299,11 +304,11 @@ fn missing_vulkan_device_fails_before_work() {
     let mut run = splatvk();
     hide_vulkan(&mut run);
     run.arg("run").arg(data("breakfast/images")).arg("--out").arg(folder.path().join("scene"));
-    refuses(&mut run, 2, &["Vulkan", "mesa-vulkan-drivers"]);
+    refuses(&mut run, 3, &["Vulkan", "mesa-vulkan-drivers"]);
     assert!(names(folder.path()).is_empty());
     let mut doctor = splatvk();
     hide_vulkan(&mut doctor);
-    let output = refuses(doctor.arg("doctor"), 2, &["missing"]);
+    let output = refuses(doctor.arg("doctor"), 3, &["missing"]);
     assert!(text(&output.stdout).contains("MISSING"), "{}", text(&output.stdout));
     run_refuses(&[&data("breakfast/images")], &["--device", "no such device"], &["no such device"]);
 }
@@ -354,7 +359,7 @@ fn full_disk_leaves_no_scene() {
         .arg(scene())
         .args(["--format", "ply", "--out"])
         .arg(folder.path().join("deep/a.ply"));
-    refuses(&mut limited(8, &export), 2, &["a.ply", "limit"]);
+    refuses(&mut limited(8, &export), 4, &["a.ply", "limit"]);
     let mut render = splatvk();
     render
         .arg("render")
@@ -366,11 +371,11 @@ fn full_disk_leaves_no_scene() {
     if memory_was_limited(limited(8, &render).output().unwrap().status) {
         return;
     }
-    refuses(&mut limited(8, &render), 2, &["limit"]);
+    refuses(&mut limited(8, &render), 4, &["limit"]);
     let mut train = splatvk();
     train.arg("train").arg("--images").arg(images).arg("--cameras").arg(cameras).arg("--points").arg(points);
     train.args(["--iterations", "2", "--out"]).arg(folder.path().join("scene"));
-    refuses(&mut limited(8, &train), 2, &["limit"]);
+    refuses(&mut limited(8, &train), 4, &["limit"]);
     assert!(names(folder.path()).is_empty(), "{:?}", names(folder.path()));
 }
 
@@ -385,7 +390,7 @@ fn missing_text_embedding_fails_before_work() {
         |query: &'static str| ["--masks", &dir, "--features", &dir, "--query", query].map(str::to_owned);
     let assert_refused = |query: &'static str, words: &[&str]| {
         let start = Instant::now();
-        run_refuses(&[&photos], &options(query).each_ref().map(String::as_str), words);
+        run_ends(3, &[&photos], &options(query).each_ref().map(String::as_str), words);
         assert!(start.elapsed() < Duration::from_secs(5), "before any work");
     };
     write_embeddings(folder.path(), &["lemon"]);

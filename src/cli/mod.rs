@@ -52,12 +52,18 @@ pub trait Program: CommandFactory + FromArgMatches {
 
 /// The command line of `splatvk`.
 pub fn main() -> ExitCode {
-    start::<Cli>()
+    ExitCode::from(run_with(std::env::args_os().collect()))
 }
 
 /// The command line of `splatvk` with the given arguments, of which the first is the name of the
 /// program. Returns the exit code.
 pub fn run_with(arguments: Vec<OsString>) -> u8 {
+    #[cfg(unix)]
+    if let Err(error) = batch::hand_over(&arguments) {
+        progress::set_format(Cli::NAME, LogFormat::Text);
+        progress::print_error(&error.to_string(), &error);
+        return error.exit_code();
+    }
     start_with::<Cli>(arguments)
 }
 

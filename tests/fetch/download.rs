@@ -264,7 +264,7 @@ fn download_names_full_disk() {
         std::os::unix::fs::symlink("/dev/full", trial.path("file.bin.partial")).unwrap();
         let error = trial.get().unwrap_err();
         let text = error.to_string();
-        assert!(error.exit_code() == 2 && text.contains("file.bin.partial"), "{text}");
+        assert!(error.exit_code() == 4 && text.contains("file.bin.partial"), "{text}");
         assert!(text.contains("free some space"), "{text}");
         std::fs::remove_file(trial.path("file.bin.partial")).unwrap();
     }

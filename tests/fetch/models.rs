@@ -205,11 +205,11 @@ fn fetched_model_is_used_and_replaced() {
     // The source serves other content now: it contradicts the checksum pinned at the first fetch.
     let forced = [&get[..], &["--force"]].concat();
     let other = serving(&depth_network(2));
-    refuses(&mut place.fetch(&forced, &other.address), 2, &["has changed since it was first fetched"]);
+    refuses(&mut place.fetch(&forced, &other.address), 3, &["has changed since it was first fetched"]);
     assert_eq!(std::fs::read(place.at(DEPTH).join("model.onnx")).unwrap(), network);
     // The installed file was changed.
     std::fs::write(place.at(DEPTH).join("model.onnx"), depth_network(3)).unwrap();
-    refuses(&mut place.fetch(&get, &server.address), 2, &["was pinned", "--force"]);
+    refuses(&mut place.fetch(&get, &server.address), 3, &["was pinned", "--force"]);
     succeeds(&mut place.fetch(&forced, &server.address));
     assert_eq!(std::fs::read(place.at(DEPTH).join("model.onnx")).unwrap(), network);
     assert!(place.hidden().is_empty(), "{:?}", place.hidden());
@@ -239,12 +239,12 @@ fn fetch_refuses_foreign_files() {
         )
         .node("Mul", "mean nothing", "predicted_depth", &[]);
     let server = serving(&network.encode());
-    refuses(&mut place.fetch(&get, &server.address), 2, &["nothing was installed", "NaN"]);
+    refuses(&mut place.fetch(&get, &server.address), 3, &["nothing was installed", "NaN"]);
     assert!(!place.at(DEPTH).exists() && place.hidden() == [format!(".fetch-{DEPTH}")]);
     // Such a model as replacement of an installed one.
     std::fs::create_dir(place.at(DEPTH)).unwrap();
     std::fs::write(place.at(DEPTH).join("model.onnx"), depth_network(1)).unwrap();
-    refuses(&mut place.fetch(&[&get[..], &["--force"]].concat(), &server.address), 2, &["NaN"]);
+    refuses(&mut place.fetch(&[&get[..], &["--force"]].concat(), &server.address), 3, &["NaN"]);
     assert_eq!(std::fs::read(place.at(DEPTH).join("model.onnx")).unwrap(), depth_network(1));
     let clean = |more: &[&str]| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_splatvk"));

@@ -64,6 +64,7 @@ pub(crate) fn visible(all: Vec<Candidate>, cuda: Option<&str>) -> Result<Vec<Can
         }
         let found = match entry.parse::<usize>() {
             Ok(number) => by_bus.get(number).copied(),
+            Err(_) if !entry.starts_with("GPU-") => None,
             Err(_) => {
                 let mut named = by_bus.iter().copied().filter(|i| uuid_begins(all[*i].uuid, entry));
                 named.next().filter(|_| named.next().is_none())

@@ -178,6 +178,8 @@ impl Error {
             Error::Input(_) => 2,
             Error::Io { source, .. } if !advice(source).is_empty() => 2,
             Error::Missing(_) | Error::MissingModel { .. } | Error::NoDevice { .. } => 3,
+            // A wrong path is a wrong command.
+            Error::Unwritable { source, .. } if is_no_place(source) => 2,
             Error::Unwritable { .. } => 4,
             Error::DeviceLost { .. } | Error::OutOfDeviceMemory { .. } => 5,
             Error::Io { .. } | Error::Gpu { .. } | Error::Work(_) => 1,
@@ -210,12 +212,18 @@ impl From<splatvk_gpu::Error> for Error {
 
 /// Advice for a place that cannot be written.
 fn elsewhere(e: &std::io::Error) -> &'static str {
-    use std::io::ErrorKind as K;
-    match (e.kind(), advice(e)) {
+    match advice(e) {
         // The path does not exist yet: it was about to be created.
-        (K::NotFound | K::NotADirectory | K::IsADirectory, _) | (_, "") => "; choose another folder",
-        (_, advice) => advice,
+        _ if is_no_place(e) => "; choose another folder",
+        "" => "; choose another folder",
+        advice => advice,
     }
+}
+
+/// Whether no file can have this path.
+fn is_no_place(e: &std::io::Error) -> bool {
+    use std::io::ErrorKind as K;
+    matches!(e.kind(), K::NotFound | K::NotADirectory | K::IsADirectory)
 }
 
 /// Advice after a lost device.

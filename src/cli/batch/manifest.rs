@@ -239,7 +239,7 @@ mod tests {
         assert_eq!(rows.len(), 2);
         assert_eq!((rows[0].input.len(), rows[1].input.len()), (1, 2));
         assert_eq!(rows[1].options["views"], 2);
-        let rows = manifest("captures.csv", "id,input\na, \"x, y\"\nb,z\n").unwrap().rows;
+        let rows = manifest("captures.csv", "id,input\na,\"x, y\"\nb,z\n").unwrap().rows;
         assert_eq!((rows[0].input[0].as_str(), rows[1].id.as_str()), ("x, y", "b"));
     }
 

@@ -22,8 +22,11 @@ use row::RowKey;
 use serde_json::json;
 use shard::Shard;
 use std::collections::BTreeSet;
+use std::ffi::OsString;
 use std::fmt::Write;
+use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
+use std::process::Command;
 use std::time::Duration;
 use store::{Failure, FailureKind, Store};
 
@@ -134,7 +137,8 @@ enum Plan<'a> {
 
 pub fn batch(args: &BatchArgs) -> Result<()> {
     if args.engine == Engine::Ray {
-        return on_ray();
+        // `hand_over` saw it before the options were parsed, unless it stands elsewhere.
+        return Err(Error::input("--engine ray belongs behind batch: splatvk batch --engine ray ..."));
     }
     let manifest = Manifest::read(&args.manifest)?;
     let rows = chosen_rows(args, &manifest);
@@ -376,13 +380,22 @@ fn columns<const N: usize>(rows: &[[String; N]]) -> String {
     text
 }
 
-/// Hands the command line over to the Python package.
-fn on_ray() -> Result<()> {
-    use std::os::unix::process::CommandExt;
+/// Hands a command line `splatvk batch ... --engine ray ...` over to the Python package, whose
+/// engine has options of its own; returns only where that fails, or is not asked for.
+///
+/// # Errors
+/// No Python.
+pub fn hand_over(arguments: &[OsString]) -> Result<()> {
+    let Some(at) = arguments.iter().position(|a| a == "batch") else { return Ok(()) };
+    let rest = &arguments[at + 1..];
+    let joined = rest.iter().any(|a| a == "--engine=ray");
+    let apart = rest.windows(2).any(|pair| pair[0] == "--engine" && pair[1] == "ray");
+    // Another command may have an argument of this name.
+    if at > 3 || !(joined || apart) {
+        return Ok(());
+    }
     let python = std::env::var_os("SPLATVK_PYTHON").unwrap_or_else(|| "python3".into());
-    // Options of the whole program may stand before the command.
-    let arguments = std::env::args_os().skip_while(|a| a != "batch").skip(1);
-    let error = std::process::Command::new(&python).args(["-m", "splatvk.batch"]).args(arguments).exec();
+    let error = Command::new(&python).args(["-m", "splatvk.batch"]).args(rest).exec();
     Err(Error::missing(format!(
         "--engine ray needs Python with the package splatvk[batch]; {} cannot be run: {}",
         python.to_string_lossy(),

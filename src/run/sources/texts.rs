@@ -209,7 +209,7 @@ mod tests {
         let mut other = encoder(folder.path(), None);
         assert!(other.embed_texts(&["blue"]).is_ok(), "what the table has needs no network");
         let error = other.embed_texts(&["green"]).unwrap_err();
-        assert!(error.exit_code() == 2 && error.to_string().contains("'green'"), "{error}");
+        assert!(error.exit_code() == 3 && error.to_string().contains("'green'"), "{error}");
 
         let none = dir_encoder(&folder.path().join("nowhere.npz"), None, &Registry::of(&[folder.path()]));
         assert!(none.err().unwrap().to_string().contains("missing"));
