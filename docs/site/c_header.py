@@ -22,7 +22,7 @@ def fields(body):
 
 def table(body):
     rows = "".join(f"| `{name}` | {meaning} |\n" for name, meaning in fields(body))
-    return "| | |\n|---|---|\n" + rows if rows else ""
+    return "| member | meaning |\n|---|---|\n" + rows if rows else ""
 
 
 def page(header):

@@ -9,7 +9,8 @@ def pages(folder):
         parts = [f"# {name}\n", f"**{schema.get('title', '')}**\n", schema.get("description", "") + "\n"]
         if rows := list(keys(schema, schema, schemas, "", ())):
             parts.append("| key | type | meaning |\n|---|---|---|")
-            parts += [f"| `{key}` | {kind} | {text} |" for key, kind, text in rows]
+            # Long keys break behind a dot.
+            parts += [f"| <code>{key.replace('.', '.<wbr>')}</code> | {kind} | {text} |" for key, kind, text in rows]
         for example in folder.glob(f"examples/{name}.json*"):
             parts.append(f"\n## Example\n\n```json\n{example.read_text().strip()}\n```\n")
         parts.append(f"\n## Schema\n\n??? note \"{file}\"\n    ```json\n" + indented((folder / file).read_text()) + "\n    ```\n")

@@ -25,6 +25,8 @@ PLACES = [
 ]
 # Pages of the navigation that may be absent.
 OPTIONAL = {"install.md", "batch.md"}
+# Pages that are made here, in their order.
+generated = []
 LINK = re.compile(r"(\]\()([^)\s#:]+)(#[^)\s]*)?(\))")
 
 
@@ -44,14 +46,14 @@ def expanded(entry):
     all = []
     for one in inside:
         if isinstance(one, str) and one.endswith("/*"):
-            pages = sorted((OUT / one[:-2]).glob("*.md"))
-            all += [page.relative_to(OUT).as_posix() for page in pages if page.name != "index.md"]
+            all += [page for page in generated if page.startswith(one[:-1])]
         elif (one := expanded(one)) is not None:
             all.append(one)
     return {title: all}
 
 
 def gather():
+    generated.clear()
     shutil.rmtree(OUT, ignore_errors=True)
     for source, _ in PLACES:
         here = ROOT / source
@@ -71,6 +73,7 @@ def gather():
 def write(path, text):
     (OUT / path).parent.mkdir(parents=True, exist_ok=True)
     (OUT / path).write_text(text)
+    generated.append(path)
 
 
 def place(source):
@@ -89,7 +92,8 @@ def copy(source):
     text = "".join(block if at % 2 else linked(block, source, to) for at, block in enumerate(fences((ROOT / source).read_text())))
     if to.startswith("log/"):
         text = "---\nsearch:\n  exclude: true\n---\n" + text
-    write(to, text)
+    (OUT / to).parent.mkdir(parents=True, exist_ok=True)
+    (OUT / to).write_text(text)
 
 
 def fences(text):
@@ -136,11 +140,11 @@ def commands():
         text = helped(name)
         parts = [f"# splatvk {name}\n\n" + described(text)]
         for sub in subcommands(text):
-            parts.append(f"## splatvk {name} {sub}\n\n" + described(helped(name, sub)))
+            parts.append(f"## splatvk {name} {sub}\n\n" + described(helped(name, sub), "###"))
         write(f"commands/{name}.md", "\n".join(parts))
 
 
-def described(text):
+def described(text, level="##"):
     """The help of a command as Markdown."""
     about, usage, rest = re.fullmatch(r"(.*?)\n\nUsage: (.*?)\n\n(.*)", text, re.S).groups()
     out = [about, "", "```text", usage, "```", ""]
@@ -148,9 +152,8 @@ def described(text):
         title, _, body = section.partition(":\n")
         items = re.split(r"\n+(?= {2,6}\S)", "\n" + body)[1:]
         if title == "Commands":
-            out += [f"- `{line.split()[0]}`: {line.split(None, 1)[1]}" for line in items if line.split()[0] != "help"] + [""]
-            continue
-        out += [f'**{title}**', "", '<dl class="options">']
+            continue  # Each has a section.
+        out += [f"{level} {title}", "", '<dl class="options">']
         for item in items:
             head, _, meaning = item.strip().partition("\n")
             out.append(f"<dt><code>{html.escape(head)}</code></dt><dd>{prose(meaning)}</dd>")
