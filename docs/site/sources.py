@@ -3,6 +3,8 @@ hook, see docs/mkdocs.yml. The program named by SPLATVK, or else target/release/
 import html, json, os, posixpath, re, shutil, subprocess
 from pathlib import Path
 
+import latex2mathml.converter
+
 import c_header, python_stub, schema_pages
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,6 +36,13 @@ def on_config(config):
     gather()
     config.nav = [entry for entry in (expanded(entry) for entry in config.nav) if entry is not None]
     return config
+
+
+def on_page_content(content, **_):
+    """The HTML of a page with its formulas as MathML."""
+    formula = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.S)
+    display = {"span": "inline", "div": "block"}
+    return formula.sub(lambda m: latex2mathml.converter.convert(html.unescape(m[2]), display=display[m[1]]), content)
 
 
 def expanded(entry):
