@@ -26,7 +26,7 @@ PLACES = [
     ("THIRD_PARTY.md", "project/third_party.md"),
 ]
 # Pages of the navigation that may be absent.
-OPTIONAL = {"install.md", "batch.md"}
+OPTIONAL = {"install.md", "cluster.md"}
 # Pages that are made here, in their order.
 generated = []
 LINK = re.compile(r"(\]\()([^)\s#:]+)(#[^)\s]*)?(\))")
