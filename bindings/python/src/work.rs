@@ -20,6 +20,7 @@ const WAITING: usize = 4096;
 #[pyclass(module = "splatvk", frozen, get_all)]
 #[derive(Default)]
 pub struct Event {
+    /// Kind of the event.
     kind: &'static str,
     /// The stage that begins.
     stage: Option<&'static str>,

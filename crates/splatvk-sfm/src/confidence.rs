@@ -16,7 +16,7 @@ pub(super) const DOUBTFUL_ROTATION: f64 = 2.0;
 pub(super) const UNSURE_FOCAL: f64 = 0.05;
 
 /// Confidence in pose and focal length of a camera. Its accuracy on generated photos is in
-/// docs/use/photos.md.
+/// docs/internals/accuracy.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Confidence {
