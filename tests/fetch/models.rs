@@ -222,7 +222,7 @@ fn fetch_refuses_foreign_files() {
     let get = [DEPTH, "--yes", "--accept", DEPTH];
     refuses(
         &mut place.fetch(&get, &server.address),
-        2,
+        3,
         &["nothing was installed", "not a complete ONNX file"],
     );
     // An invalid graph in a valid file.
