@@ -123,10 +123,10 @@ fn time(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// What is to be done with a row.
+/// Use of a row in this batch.
 enum Plan<'a> {
     /// Its result has this key.
-    Kept,
+    Kept(&'a Row),
     /// It was refused with this key before.
     Refused(Failure),
     /// It is unusable.
@@ -223,8 +223,16 @@ fn plan<'a>(args: &BatchArgs, store: &Store, row: &'a Row, key: Result<RowKey, E
             };
         }
     };
+    if let Err(error) = store.check_place(&row.id) {
+        let failed = Ending::Failed {
+            code: error.exit_code(),
+            message: error.to_string(),
+            kind: error.kind().to_owned(),
+        };
+        return Ok(Failure::of(&row.id, &key.key, 0, &failed).map_or(Plan::Kept(row), Plan::Failed));
+    }
     if store.success(&row.id).is_some_and(|s| s["key"] == key.key) {
-        return Ok(Plan::Kept);
+        return Ok(Plan::Kept(row));
     }
     let failure = store.failure(&row.id).filter(|f| f.key == key.key && f.kind == FailureKind::Refused);
     if let Some(failure) = failure.filter(|_| args.only.is_none()) {
@@ -253,7 +261,11 @@ fn work(
     let mut jobs = Vec::new();
     for plan in plans {
         match plan {
-            Plan::Kept => kept += 1,
+            Plan::Kept(row) => {
+                // Of a change that was taken back.
+                store.forget_failure(&row.id)?;
+                kept += 1;
+            }
             Plan::Refused(_) => refused += 1,
             Plan::Failed(failure) => {
                 progress.warn(&format!("{}: {}: {}", failure.id, failure.kind.name(), failure.message));
@@ -329,7 +341,7 @@ fn report_plan(
     let mut lines = Vec::new();
     for (row, plan) in rows.iter().zip(plans) {
         let (size, text) = match plan {
-            Plan::Kept => (None, "done".to_owned()),
+            Plan::Kept(_) => (None, "done".to_owned()),
             Plan::Refused(f) | Plan::Failed(f) => (None, format!("{}: {}", f.kind.name(), f.message)),
             Plan::Make(_, key) => {
                 make += 1;

@@ -159,6 +159,18 @@ impl Store {
         self.root.join(id)
     }
 
+    /// Refuses a place where something else than a result is.
+    pub fn check_place(&self, id: &str) -> Result<()> {
+        let place = self.place(id);
+        if place.symlink_metadata().is_err() || place.join(SUCCESS).is_file() {
+            return Ok(());
+        }
+        Err(Error::input(format!(
+            "{}: exists and is no result of a batch; move it away, or choose another --out",
+            place.display()
+        )))
+    }
+
     /// Folder and log of an attempt.
     pub fn attempt(&self, id: &str, key: &str, number: usize) -> (PathBuf, PathBuf) {
         let name = format!("{id}-{}-{number}", key.get(..16).unwrap_or(key));
@@ -220,27 +232,25 @@ impl Store {
 
     /// Moves a finished attempt to its place; an older result is replaced whole.
     pub fn publish(&self, id: &str, attempt: &Path, log: &Path) -> Result<()> {
+        self.check_place(id)?;
         let place = self.place(id);
         let unwritable = Error::unwritable(&place);
         let moved = std::fs::rename(log, attempt.join("log.jsonl"));
         moved.map_err(Error::unwritable(log))?;
         if place.symlink_metadata().is_err() {
             std::fs::rename(attempt, &place).map_err(unwritable)?;
-        } else if place.join(SUCCESS).is_file() {
+        } else {
             let aside = attempt.with_extension("old");
             swap(attempt, &place, &aside).map_err(unwritable)?;
             remove(attempt)?;
             remove(&aside)?;
-        } else {
-            return Err(Error::input(format!(
-                "{}: exists and is no result of a batch; move it away, or choose another --out",
-                place.display()
-            )));
         }
-        for ending in ["json", "log"] {
-            remove(&self.failed(id, ending))?;
-        }
-        Ok(())
+        self.forget_failure(id)
+    }
+
+    /// Removes the record of the last failure.
+    pub fn forget_failure(&self, id: &str) -> Result<()> {
+        ["json", "log"].iter().try_for_each(|ending| remove(&self.failed(id, ending)))
     }
 
     /// Keeps the failure of a row with its log, and removes the attempt.
