@@ -10,7 +10,6 @@ use crate::sync::lock;
 use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::marker::PhantomData;
-use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread::Scope;
 use std::time::Instant;
