@@ -59,9 +59,9 @@
 //! Anything else is an error that names the file and the line or the block.
 //!
 //! # Publishing
-//! [`pack`] writes the compiled modules and bindings to `packed` in the folder of shaders. A crate
-//! published with it depends on this one with `default-features = false`; whoever builds it needs
-//! no shaderc.
+//! A crate can be published with `OUT_DIR/shaders.rs` and the modules that it includes, as the
+//! folder `packed` in the folder of shaders. It depends on this one with `default-features = false`,
+//! and whoever builds it needs no shaderc.
 //!
 //! # Requirements
 //! The feature `compile` (default) takes libshaderc, as the `shaderc` crate finds or builds it.
@@ -78,9 +78,6 @@ mod reflect;
 mod source;
 
 use std::path::{Path, PathBuf};
-
-/// Folder of packed modules, in the folder of shaders.
-const PACKED: &str = "packed";
 
 /// Compiles the shaders of `folder` and writes `OUT_DIR/shaders.rs`. For `build.rs`.
 ///
@@ -108,35 +105,12 @@ fn bindings(folder: &Path, cache: &Path) -> Result<String, String> {
 
 #[cfg(not(feature = "compile"))]
 fn bindings(folder: &Path, _: &Path) -> Result<String, String> {
-    let packed = folder.join(PACKED).join("shaders.rs");
+    let packed = folder.join("packed/shaders.rs");
     println!("cargo::rerun-if-changed={}", packed.display());
     let absolute = packed.canonicalize().map_err(|e| {
         format!("{}: {e}; the feature `compile` of splatvk-gpu-build compiles the shaders", packed.display())
     })?;
     Ok(format!("include!({:?});", absolute.display().to_string()))
-}
-
-/// Compiles the shaders of `folder` into `folder/packed`, for a crate that is published with them.
-///
-/// # Errors
-/// As [`generate`], and files that cannot be written.
-#[cfg(feature = "compile")]
-pub fn pack(folder: &Path) -> Result<(), String> {
-    let target = folder.join(PACKED);
-    let failed = |e: std::io::Error| format!("{}: {e}", target.display());
-    // A module of an earlier state would be published as well.
-    if target.exists() {
-        std::fs::remove_dir_all(&target).map_err(failed)?;
-    }
-    let code = generate(folder, &target)?;
-    std::fs::write(target.join("shaders.rs"), code).map_err(failed)?;
-    for entry in std::fs::read_dir(target.join("spirv")).map_err(failed)? {
-        let path = entry.map_err(failed)?.path();
-        if path.to_string_lossy().ends_with(".reflect.spv") {
-            std::fs::remove_file(&path).map_err(failed)?;
-        }
-    }
-    Ok(())
 }
 
 /// The Rust source of the bindings, to be written into `cache`: it includes the compiled modules,
