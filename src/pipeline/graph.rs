@@ -10,7 +10,6 @@ use crate::sync::lock;
 use crate::{Error, Result};
 use std::collections::BTreeSet;
 use std::marker::PhantomData;
-use std::path::PathBuf;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread::Scope;
 use std::time::Instant;
@@ -218,34 +217,9 @@ impl<'g> Graph<'g> {
 pub(crate) fn program() -> &'static str {
     static PROGRAM: OnceLock<String> = OnceLock::new();
     PROGRAM.get_or_init(|| {
-        let file = own_library().map_or_else(std::env::current_exe, Ok);
-        let bytes = file.and_then(std::fs::read);
+        let bytes = crate::files::own_file().and_then(std::fs::read);
         bytes.map_or_else(|_| env!("CARGO_PKG_VERSION").to_owned(), |b| crate::files::sha256(&b))
     })
-}
-
-/// The shared library that holds this code, in a process of another program: Python, or a host of
-/// the C interface.
-#[cfg(all(target_os = "linux", target_env = "gnu"))]
-fn own_library() -> Option<PathBuf> {
-    use std::os::unix::ffi::OsStrExt;
-    let mut found = std::mem::MaybeUninit::<libc::Dl_info>::uninit();
-    // SAFETY: an address of this library, and a place for the result, which is only read where the
-    // call succeeds; the name lives as long as the library.
-    let name = unsafe {
-        if libc::dladdr(program as *const () as *const libc::c_void, found.as_mut_ptr()) == 0 {
-            return None;
-        }
-        std::ffi::CStr::from_ptr(found.assume_init().dli_fname)
-    };
-    let path = PathBuf::from(std::ffi::OsStr::from_bytes(name.to_bytes()));
-    let is_library = path.file_name()?.to_string_lossy().contains(".so");
-    is_library.then_some(path)
-}
-
-#[cfg(not(all(target_os = "linux", target_env = "gnu")))]
-fn own_library() -> Option<PathBuf> {
-    None
 }
 
 /// State of a running graph.

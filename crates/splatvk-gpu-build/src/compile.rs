@@ -11,6 +11,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 /// Raise when the options below change, so that cached modules are not reused.
 const CACHE_VERSION: u32 = 1;
 
+/// Folder of compiled modules in the cache.
+pub const FOLDER: &str = "spirv";
+
 /// One shader file with all its compiled modules.
 pub struct Family {
     pub name: String,
@@ -27,7 +30,8 @@ pub struct Module {
     pub variant: Vec<u32>,
     pub subgroup_size: Option<u32>,
     pub float_atomics: Option<bool>,
-    pub spirv: PathBuf,
+    /// Name of the file in [`FOLDER`].
+    pub spirv: String,
     pub reflection: Reflection,
 }
 
@@ -38,7 +42,7 @@ pub struct Compiler {
 
 impl Compiler {
     pub fn new(out_dir: &Path) -> Result<Self, String> {
-        let cache = out_dir.join("spirv");
+        let cache = out_dir.join(FOLDER);
         std::fs::create_dir_all(&cache).map_err(|e| format!("{}: {e}", cache.display()))?;
         let shaderc = shaderc::Compiler::new().map_err(|e| format!("shaderc did not start: {e}"))?;
         Ok(Self { shaderc, cache })
@@ -76,8 +80,8 @@ impl Compiler {
         });
     }
 
-    /// One module: the path of its optimised SPIR-V and the reflection of the unoptimised one.
-    fn module(&self, source: &Source, macros: &[(String, u32)]) -> Result<(PathBuf, Reflection), String> {
+    /// One module: the file name of its optimised SPIR-V and the reflection of the unoptimised one.
+    fn module(&self, source: &Source, macros: &[(String, u32)]) -> Result<(String, Reflection), String> {
         let mut hasher = DefaultHasher::new();
         (CACHE_VERSION, &source.path, &source.closure, macros).hash(&mut hasher);
         let stem = format!("{}-{:016x}", source.name, hasher.finish());
@@ -90,7 +94,7 @@ impl Compiler {
         let words = read_words(&plain)?;
         let reflection =
             reflect::reflect(&words).map_err(|e| format!("{}: error: {e}", source.path.display()))?;
-        Ok((optimised, reflection))
+        Ok((format!("{stem}.spv"), reflection))
     }
 
     fn compile(

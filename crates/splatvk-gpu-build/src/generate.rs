@@ -1,6 +1,6 @@
 //! Writes the Rust bindings. Generated code names everything by absolute paths in `splatvk_gpu`, so
 //! that it compiles in any crate that depends on it.
-use crate::compile::{Family, Module};
+use crate::compile::{FOLDER, Family, Module};
 use crate::constants::{self, Constant};
 use crate::reflect::{Access, Binding, Element, Layout, Member, Scalar};
 use std::collections::BTreeMap;
@@ -297,7 +297,8 @@ fn family_static(w: &mut String, family: &Family, all: &[Binding]) {
             })
             .collect();
         let _ = writeln!(w, "            bindings: &[{}],", bindings.join(", "));
-        let _ = writeln!(w, "            spirv: include_bytes!({:?}),", m.spirv.display().to_string());
+        // Relative to the file of bindings, so that both can be packed into a published crate.
+        let _ = writeln!(w, "            spirv: include_bytes!(\"{FOLDER}/{}\"),", m.spirv);
         let _ = writeln!(w, "        }},");
     }
     let _ = writeln!(w, "    ] }};");

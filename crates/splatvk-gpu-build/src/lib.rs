@@ -58,12 +58,23 @@
 //! literal workgroup sizes, no specialisation constants; structures without unnamed padding.
 //! Anything else is an error that names the file and the line or the block.
 //!
+//! # Publishing
+//! A crate can be published with `OUT_DIR/shaders.rs` and the modules that it includes, as the
+//! folder `packed` in the folder of shaders. It depends on this one with `default-features = false`,
+//! and whoever builds it needs no shaderc.
+//!
 //! # Requirements
-//! libshaderc, as the [`shaderc`] crate finds or builds it.
+//! The feature `compile` (default) takes libshaderc, as the `shaderc` crate finds or builds it.
+//! Without the feature nothing is compiled and `packed` is taken.
+#[cfg(feature = "compile")]
 mod compile;
+#[cfg(feature = "compile")]
 mod constants;
+#[cfg(feature = "compile")]
 mod generate;
+#[cfg(feature = "compile")]
 mod reflect;
+#[cfg(feature = "compile")]
 mod source;
 
 use std::path::{Path, PathBuf};
@@ -77,7 +88,7 @@ pub fn compile(folder: impl AsRef<Path>) {
     let out = std::env::var_os("OUT_DIR").ok_or("OUT_DIR is not set: call this in build.rs");
     let written = out.map_err(str::to_owned).and_then(|out| {
         let path = PathBuf::from(&out).join("shaders.rs");
-        let code = generate(folder.as_ref(), Path::new(&out))?;
+        let code = bindings(folder.as_ref(), Path::new(&out))?;
         std::fs::write(&path, code).map_err(|e| format!("{}: {e}", path.display()))
     });
     if let Err(message) = written {
@@ -87,11 +98,27 @@ pub fn compile(folder: impl AsRef<Path>) {
     }
 }
 
-/// The Rust source of the bindings. `cache` keeps the compiled modules, which the source includes
-/// by their absolute paths. Prints `cargo::rerun-if-changed` lines.
+#[cfg(feature = "compile")]
+fn bindings(folder: &Path, cache: &Path) -> Result<String, String> {
+    generate(folder, cache)
+}
+
+#[cfg(not(feature = "compile"))]
+fn bindings(folder: &Path, _: &Path) -> Result<String, String> {
+    let packed = folder.join("packed/shaders.rs");
+    println!("cargo::rerun-if-changed={}", packed.display());
+    let absolute = packed.canonicalize().map_err(|e| {
+        format!("{}: {e}; the feature `compile` of splatvk-gpu-build compiles the shaders", packed.display())
+    })?;
+    Ok(format!("include!({:?});", absolute.display().to_string()))
+}
+
+/// The Rust source of the bindings, to be written into `cache`: it includes the compiled modules,
+/// which `cache` keeps, by paths relative to itself. Prints `cargo::rerun-if-changed` lines.
 ///
 /// # Errors
 /// The messages of all shaders that do not compile or use something unsupported, one per line.
+#[cfg(feature = "compile")]
 pub fn generate(folder: &Path, cache: &Path) -> Result<String, String> {
     let sources = source::collect(folder)?;
     compile::Compiler::warm(cache, &sources);
@@ -115,5 +142,5 @@ pub fn generate(folder: &Path, cache: &Path) -> Result<String, String> {
     generate::shaders(&families, &shared)
 }
 
-#[cfg(test)]
+#[cfg(all(test, feature = "compile"))]
 mod tests;

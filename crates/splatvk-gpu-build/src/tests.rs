@@ -133,3 +133,13 @@ fn unchanged_shaders_come_from_the_cache() {
     fs::write(folder.path().join("one.comp"), text.replace("1.0", "2.0")).unwrap();
     assert_ne!(generate(folder.path(), cache.path()).unwrap(), first);
 }
+
+#[test]
+fn bindings_include_modules_by_relative_paths() {
+    let (folder, cache) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let text = shader("layout(binding = 0) buffer To { float to[]; };\nvoid main() { to[0] = 1.0; }");
+    fs::write(folder.path().join("one.comp"), &text).unwrap();
+    let code = generate(folder.path(), cache.path()).unwrap();
+    let path = code.split("include_bytes!(\"").nth(1).and_then(|c| c.split('"').next()).unwrap();
+    assert!(path.starts_with("spirv/") && cache.path().join(path).exists(), "{path}");
+}

@@ -1,6 +1,6 @@
 //! ONNX Runtime, loaded at run time from a shared library: once per process, since a second library
 //! cannot be loaded beside it.
-use crate::files::home;
+use crate::files::{home, installed};
 use crate::{Error, Result};
 use ort::environment::Environment;
 use ort::logging::LogLevel;
@@ -17,8 +17,8 @@ const LIBRARY: &str = "libonnxruntime.so";
 /// The library's path and its environment, or the error of loading it.
 static LOADED: OnceLock<Result<(PathBuf, Environment), String>> = OnceLock::new();
 
-/// The library in use, loaded on the first call: `ORT_DYLIB_PATH`, else `lib` under [`home`], else
-/// the system's.
+/// The library in use, loaded on the first call: `ORT_DYLIB_PATH`, else `lib/splatvk` of the
+/// package that the program came in, else `lib` under [`home`], else the system's.
 pub fn runtime() -> Result<PathBuf> {
     // ort panics when used without a library, so every session goes through this check first.
     Ok(loaded()?.0.clone())
@@ -35,7 +35,11 @@ fn load() -> Result<(PathBuf, Environment), String> {
             |e| format!("ONNX Runtime: ORT_DYLIB_PATH={} cannot be loaded ({e}); {fix}", path.display());
         return try_load(&path).map(|e| (path.clone(), e)).map_err(failed);
     }
-    let own = home().map(|home| home.join("lib").join(LIBRARY));
+    // A package brings the version that it was tested with; the user's folder may have an older one.
+    let own = match installed("lib/splatvk").map(|folder| folder.join(LIBRARY)).filter(|l| l.exists()) {
+        Some(packaged) => Ok(packaged),
+        None => home().map(|home| home.join("lib").join(LIBRARY)),
+    };
     if let Ok(own) = &own
         && own.exists()
     {

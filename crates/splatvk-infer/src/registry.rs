@@ -9,8 +9,8 @@ use serde::Deserialize;
 use super::compute::Compute;
 use super::runtime::Session;
 use crate::error::words;
-use crate::files::content_hash;
 pub use crate::files::home;
+use crate::files::{content_hash, installed};
 use crate::{Error, Result};
 
 const PACK: &str = include_str!("pack.json");
@@ -95,7 +95,8 @@ pub struct Registry {
 
 impl Registry {
     /// The folders of `models_dir`, else of `SPLATVK_MODELS` (both may be lists, written like
-    /// `PATH`), else `models` under [`home`]. Opening does not read the files.
+    /// `PATH`), else `models` under [`home`] and those of the package that the program came in.
+    /// Opening does not read the files.
     pub fn open(models_dir: Option<&Path>) -> Result<Self> {
         Registry::with(models_dir, Compute::default())
     }
@@ -116,7 +117,11 @@ impl Registry {
         let set = || std::env::var_os("SPLATVK_MODELS").filter(|v| !v.is_empty());
         match models_dir.map(|d| split_list(d.as_os_str())).or_else(|| set().map(|text| split_list(&text))) {
             Some(folders) => Ok(folders),
-            None => Ok(vec![home()?.join("models")]),
+            None => match (home(), installed("share/splatvk/models")) {
+                (Ok(home), packaged) => Ok([home.join("models")].into_iter().chain(packaged).collect()),
+                (Err(_), Some(packaged)) => Ok(vec![packaged]),
+                (Err(e), None) => Err(e),
+            },
         }
     }
 
@@ -184,7 +189,10 @@ impl Registry {
 
     fn inspect(&self, entry: &PackFile) -> ModelStatus {
         let places: Vec<PathBuf> = self.folders.iter().map(|f| f.join(&entry.file)).collect();
+        // The user's folder may keep a file of another version, which the package has right.
+        let sound = |p: &&PathBuf| content_hash(p).is_ok_and(|hash| hash == entry.sha256);
         let there = places.iter().find(|p| p.exists()).or(places.first());
+        let there = places.iter().find(sound).or(there);
         let file = there.cloned().unwrap_or_else(|| PathBuf::from(&entry.file));
         let (actual, problem) = match content_hash(&file) {
             Ok(hash) if hash == entry.sha256 => (Some(hash), None),

@@ -6,6 +6,7 @@ mod home;
 mod owner;
 mod partial;
 mod place;
+mod program;
 mod replace;
 mod within;
 
@@ -19,6 +20,7 @@ pub use owner::{Found, Held, look};
 pub use partial::{HIDDEN, leftovers, remove_leftover, remove_unfinished};
 pub use partial::{Partial, check_free, check_free_inside, is_leftover, restore, sweep};
 pub use place::{Kind, check_place, check_spared, foreign, listed, next_free};
+pub use program::{installed, own_file};
 pub use replace::swap;
 pub use within::within;
 
