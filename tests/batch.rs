@@ -112,7 +112,11 @@ fn retries_follow_the_kind_of_failure() {
 
     // Finished and refused rows are not touched again, others are tried.
     let again = batch.run(1, &["--retries", "0"]);
-    assert_eq!((number(&again, "kept"), number(&again, "done"), number(&again, "failed")), (4, 0, 3), "{again}");
+    assert_eq!(
+        (number(&again, "kept"), number(&again, "done"), number(&again, "failed")),
+        (4, 0, 3),
+        "{again}"
+    );
     assert_eq!((batch.attempts("good"), batch.attempts("alone"), batch.attempts("never")), (1, 1, 4));
     batch.run(1, &["--only", "failed", "--retries", "0"]);
     assert_eq!((batch.attempts("good"), batch.attempts("alone")), (1, 2));
@@ -249,9 +253,12 @@ fn scenes_of_a_batch_are_those_of_run() {
     assert!(failure("lonely").contains("refused"), "{}", failure("lonely"));
     assert!(failure("odd").contains("there is no option iteration"), "{}", failure("odd"));
     assert!(failure("odder").contains("export obj"), "{}", failure("odder"));
-    let success: Value = serde_json::from_slice(&std::fs::read(at("out/table/_SUCCESS.json")).unwrap()).unwrap();
+    let success: Value =
+        serde_json::from_slice(&std::fs::read(at("out/table/_SUCCESS.json")).unwrap()).unwrap();
     assert_eq!(success["answers"][0]["text"], "lemon");
-    assert!(success["psnr"].as_f64().unwrap() > 10.0 && success["device"]["uuid"].as_str().unwrap().len() == 36);
+    assert!(
+        success["psnr"].as_f64().unwrap() > 10.0 && success["device"]["uuid"].as_str().unwrap().len() == 36
+    );
     for file in ["table.glb", "t.spz", "colmap/cameras.txt"] {
         assert!(at("out/table/exports").join(file).is_file(), "{file}");
     }

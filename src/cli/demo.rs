@@ -88,7 +88,11 @@ fn plan(args: &DemoArgs, scene: &Path) -> Result<RunPlan> {
         let place = photos.join(name);
         std::fs::write(&place, bytes).map_err(Error::unwritable(&place))?;
     }
-    let text = format!("Four photos of a breakfast table, in {}, become a scene.\n{}\n", photos.display(), about(&info));
+    let text = format!(
+        "Four photos of a breakfast table, in {}, become a scene.\n{}\n",
+        photos.display(),
+        about(&info)
+    );
     if !args.device.json {
         print(&text)?;
     }
@@ -154,7 +158,12 @@ fn open_browser(url: &str) {
     } else {
         "xdg-open"
     };
-    let quiet = Command::new(program).arg(url).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null()).spawn();
+    let quiet = Command::new(program)
+        .arg(url)
+        .stdin(Stdio::null())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn();
     // The address is printed in any case.
     if let Ok(mut child) = quiet {
         std::thread::spawn(move || child.wait());

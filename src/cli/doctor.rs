@@ -74,9 +74,7 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
     }
     match missing {
         0 => Ok(()),
-        n => Err(Error::missing(format!(
-            "{n} required parts are missing; next: {next}"
-        ))),
+        n => Err(Error::missing(format!("{n} required parts are missing; next: {next}"))),
     }
 }
 
@@ -164,7 +162,8 @@ fn word(status: Status) -> &'static str {
 
 /// The command to run next: it mends the first missing part, or makes a first scene.
 fn next(lines: &[Line]) -> &'static str {
-    let missing = |topic: &str| lines.iter().any(|l| l.status == Status::Missing && l.topic.starts_with(topic));
+    let missing =
+        |topic: &str| lines.iter().any(|l| l.status == Status::Missing && l.topic.starts_with(topic));
     let in_python = || {
         let program = std::env::current_exe().unwrap_or_default();
         program.file_name().is_some_and(|name| name.to_string_lossy().starts_with("python"))

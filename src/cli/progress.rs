@@ -58,10 +58,9 @@ pub fn print_error(message: &str, error: &Error) {
     }
     let message = one_line(message);
     match as_json() {
-        true => write_event(
-            "error",
-            json!({ "message": message, "kind": error.kind(), "exit_code": exit_code }),
-        ),
+        true => {
+            write_event("error", json!({ "message": message, "kind": error.kind(), "exit_code": exit_code }))
+        }
         false => write_line(&format!("{}: {message}", NAME.get().unwrap_or(&"splatvk"))),
     }
 }

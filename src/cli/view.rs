@@ -214,8 +214,9 @@ fn page(
 fn reply(ready: Option<&mut QueryScene>, text: &str, options: &QueryOptions) -> Answer {
     let ready = ready.ok_or_else(|| (404, "this scene answers no questions".to_owned()))?;
     let clock = Instant::now();
-    let answers =
-        ready.ask(text, options).map_err(|e| (if (2..=3).contains(&e.exit_code()) { 422 } else { 500 }, e.to_string()))?;
+    let answers = ready
+        .ask(text, options)
+        .map_err(|e| (if (2..=3).contains(&e.exit_code()) { 422 } else { 500 }, e.to_string()))?;
     let mut reply = answers.shown().json();
     reply["milliseconds"] = (1e3 * clock.elapsed().as_secs_f64()).into();
     Ok(reply.to_string())

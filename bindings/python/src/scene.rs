@@ -183,19 +183,24 @@ impl Scene {
     /// -1 without one.
     #[getter]
     fn codes<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
-        Self::kept(this, |s| &s.codes, &[LEVEL_NAMES.len()], |live| {
-            let mut codes = vec![-1; live.splats().len() * LEVEL_NAMES.len()];
-            let levels = live.language().map_or(&[][..], |field| &field.levels);
-            for (at, level) in levels.iter().enumerate() {
-                for (splat, code) in splat_codes(level).into_iter().enumerate() {
-                    let place = codes.get_mut(splat * LEVEL_NAMES.len() + at);
-                    if let (Some(place), Some(Ok(code))) = (place, code.map(i32::try_from)) {
-                        *place = code;
+        Self::kept(
+            this,
+            |s| &s.codes,
+            &[LEVEL_NAMES.len()],
+            |live| {
+                let mut codes = vec![-1; live.splats().len() * LEVEL_NAMES.len()];
+                let levels = live.language().map_or(&[][..], |field| &field.levels);
+                for (at, level) in levels.iter().enumerate() {
+                    for (splat, code) in splat_codes(level).into_iter().enumerate() {
+                        let place = codes.get_mut(splat * LEVEL_NAMES.len() + at);
+                        if let (Some(place), Some(Ok(code))) = (place, code.map(i32::try_from)) {
+                            *place = code;
+                        }
                     }
                 }
-            }
-            codes
-        })
+                codes
+            },
+        )
     }
     /// Degree of the spherical harmonics, 0 to 3.
     #[getter]
@@ -280,7 +285,8 @@ impl Scene {
                     arrays::owned(py, planes, &[view.codes.len(), h, w])?
                 }
                 other => {
-                    let text = format!("there is no channel {other:?}; there are rgb, alpha, depth and codes");
+                    let text =
+                        format!("there is no channel {other:?}; there are rgb, alpha, depth and codes");
                     return Err(errors::named(py, "InputError", text));
                 }
             };
@@ -329,8 +335,9 @@ impl Scene {
         converted(this, "to_trimesh")
     }
     /// Logs splats, cameras and boxes of things to a Rerun recording: `rerun.init(...)` first.
-    fn to_rerun<'py>(this: &Bound<'py, Self>, path: Option<&str>) -> PyResult<Bound<'py, PyAny>> {
-        this.py().import("splatvk._convert")?.call_method1("to_rerun", (this, path.unwrap_or("scene")))
+    #[pyo3(signature = (path = "scene"))]
+    fn to_rerun<'py>(this: &Bound<'py, Self>, path: &str) -> PyResult<Bound<'py, PyAny>> {
+        this.py().import("splatvk._convert")?.call_method1("to_rerun", (this, path))
     }
     /// The interactive view in a notebook, with questions and a selection that comes back:
     /// `widget.mask` selects splats of the scene. Needs `pip install splatvk[notebook]`.
@@ -420,7 +427,11 @@ pub fn reconstruct_pixels(
         let array = array.as_array();
         let (height, width, channels) = array.dim();
         if channels != 3 {
-            return Err(errors::named(py, "InputError", format!("{name}: (H, W, 3) is needed, not {:?}", array.shape())));
+            return Err(errors::named(
+                py,
+                "InputError",
+                format!("{name}: (H, W, 3) is needed, not {:?}", array.shape()),
+            ));
         }
         let values: Vec<f32> = array.iter().copied().collect();
         let image = RgbImage { width, height, data: values.as_chunks::<3>().0.to_vec() };

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 import splatvk
 
 PHOTOS = Path(__file__).parents[3] / "tests" / "data" / "breakfast" / "images"

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-
 import splatvk
 
 PIXELS = [np.full((48, 64, 3), 0.5, np.float32)] * 2

@@ -9,9 +9,8 @@ import sys
 import threading
 
 import pytest
-from conftest import PHOTOS
-
 import splatvk
+from conftest import PHOTOS
 
 
 def test_progress(made):

@@ -8,9 +8,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from conftest import PHOTOS
-
 import splatvk
+from conftest import PHOTOS
 
 OPTIONS = {"max_size": 160, "iterations": 10, "preset": "draft", "views": 3}
 LOOPS = 200
@@ -33,8 +32,11 @@ def test_scene_and_answer_are_those_of_the_command(tmp_path):
     for array in ["means", "scales", "quats", "opacities", "sh", "seen", "codes"]:
         own, other = getattr(made, array), getattr(loaded, array)
         assert np.array_equal(own, other), array
-    assert all(np.array_equal(a.w2c, b.w2c) for a, b in zip(made.cameras, loaded.cameras))
-    answer = made.query("lemon")
+    # Files hold cameras with fewer digits than the memory of a run.
+    stored = splatvk.load(tmp_path / "package")
+    assert all(np.array_equal(a.w2c, b.w2c) for a, b in zip(stored.cameras, loaded.cameras, strict=True))
+    assert all(np.allclose(a.w2c, b.w2c) for a, b in zip(made.cameras, loaded.cameras, strict=True))
+    answer = stored.query("lemon")
     asked = json.loads(command("query", tmp_path / "command", "lemon", "--json"))
     [record] = asked["queries"]
     assert (answer.presence, answer.p_value) == (record["presence"], record["p_value"])
@@ -53,10 +55,11 @@ def test_memory_is_stable_over_many_scenes(scene):
     for loop in range(LOOPS):
         other = splatvk.load(path)
         other.render(camera, ["rgb", "depth"])
-        answer = other.query("lemon")
-        answer.mask()
         other[np.arange(100)].means.sum()
-        del other, answer
+        # A question loads the words anew, a second on two cores.
+        if loop % 5 == 0:
+            other.query("lemon").mask()
+        del other
         if loop >= WARM_UP and loop % 20 == 0:
             gc.collect()
             sizes.append(resident())

@@ -15,7 +15,8 @@ impl Pci {
     /// Reads "0000:3b:00.0"; the domain may be missing.
     fn parse(text: &str) -> Option<Pci> {
         let (bus, function) = text.rsplit_once('.').unwrap_or((text, "0"));
-        let mut parts = bus.split(':').map(|part| u32::from_str_radix(part, 16).ok()).collect::<Option<Vec<_>>>()?;
+        let mut parts =
+            bus.split(':').map(|part| u32::from_str_radix(part, 16).ok()).collect::<Option<Vec<_>>>()?;
         if parts.len() == 2 {
             parts.insert(0, 0);
         }
@@ -78,9 +79,8 @@ pub(crate) fn visible(all: Vec<Candidate>, cuda: Option<&str>) -> Result<Vec<Can
     // The places of NVIDIA's devices in the order of preference are taken by the named ones in
     // their order.
     let mut named = kept.into_iter();
-    let order: Vec<usize> = (0..all.len())
-        .filter_map(|i| if by_bus.contains(&i) { named.next() } else { Some(i) })
-        .collect();
+    let order: Vec<usize> =
+        (0..all.len()).filter_map(|i| if by_bus.contains(&i) { named.next() } else { Some(i) }).collect();
     if order.is_empty() && !all.is_empty() {
         return Err(Error::no_device(format!(
             "CUDA_VISIBLE_DEVICES is `{list}` and hides every Vulkan device; change it, or unset it"
@@ -200,11 +200,15 @@ mod tests {
     fn equal_cards_are_told_apart_by_uuid_and_pci_address() {
         let bus = |choice: &str| choose(node(), Some(choice)).unwrap().pci.unwrap().0[1];
         assert_eq!(bus("1"), 0x18);
-        for choice in ["uuid:afaf", "uuid:GPU-AFAFAFAF-afaf", "pci:0000:af:00.0", "pci:AF:00.0", "pci:af:00"] {
+        for choice in ["uuid:afaf", "uuid:GPU-AFAFAFAF-afaf", "pci:0000:af:00.0", "pci:AF:00.0", "pci:af:00"]
+        {
             assert_eq!(bus(choice), 0xaf, "{choice}");
         }
         let several = said(node(), Some("h100"));
-        assert!(several.contains("several") && several.contains("2 = NVIDIA H100 (uuid:afafafaf-afaf-"), "{several}");
+        assert!(
+            several.contains("several") && several.contains("2 = NVIDIA H100 (uuid:afafafaf-afaf-"),
+            "{several}"
+        );
         assert!(said(node(), Some("uuid:77")).starts_with("no Vulkan device matches `uuid:77`"));
         assert!(said(node(), Some("uuid:")).starts_with("no Vulkan device matches"));
         assert!(said(node(), Some("4")).starts_with("no Vulkan device matches"));

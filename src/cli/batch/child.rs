@@ -158,7 +158,11 @@ mod tests {
         let (done, log) = shell("cat >&2", None);
         assert_eq!((done, log.as_str()), (Ending::Done, "row\n"));
         let error = r#"{"event":"error","kind":"memory","message":"full","exit_code":5}"#;
-        let failed = |code, message: &str, kind: &str| Ending::Failed { code, message: message.into(), kind: kind.into() };
+        let failed = |code, message: &str, kind: &str| Ending::Failed {
+            code,
+            message: message.into(),
+            kind: kind.into(),
+        };
         assert_eq!(shell(&format!("echo '{error}' >&2; exit 5"), None).0, failed(5, "full", "memory"));
         assert_eq!(shell("echo panicked >&2; exit 101", None).0, failed(101, "panicked", ""));
         assert_eq!(shell("kill -9 $$", None).0, Ending::Killed(9));
@@ -171,7 +175,8 @@ mod tests {
         let (ending, log) = shell(script, Some(Duration::from_millis(200)));
         assert!(ending == Ending::TimedOut && started.elapsed() < Duration::from_secs(20));
         let child = log.trim();
-        let gone = || std::fs::read_to_string(format!("/proc/{child}/stat")).map_or(true, |s| s.contains(") Z "));
+        let gone =
+            || std::fs::read_to_string(format!("/proc/{child}/stat")).map_or(true, |s| s.contains(") Z "));
         while !gone() {
             assert!(started.elapsed() < Duration::from_secs(20), "process {child} is alive");
             std::thread::sleep(POLL);

@@ -104,7 +104,8 @@ fn table(text: &str, place: &Path) -> Result<Vec<Row>> {
     }
     let mut rows = Vec::new();
     for record in reader.records() {
-        let record = record.map_err(|e| wrong(e.position().map_or(0, csv::Position::line), &e.to_string()))?;
+        let record =
+            record.map_err(|e| wrong(e.position().map_or(0, csv::Position::line), &e.to_string()))?;
         let field = |i: usize| record.get(i).unwrap_or_default().to_owned();
         let row = checked(Row {
             id: field(id),
@@ -261,8 +262,11 @@ mod tests {
         }
         assert!(refused("c.jsonl", "\n").contains("no row"));
         assert!(refused("c.jsonl", &format!("{row}\n{row}")).contains("two rows have the id a;"));
-        let alike = refused("c.jsonl", r#"{"id": "a", "input": "x"}
-            {"id": "A", "input": "x"}"#);
+        let alike = refused(
+            "c.jsonl",
+            r#"{"id": "a", "input": "x"}
+            {"id": "A", "input": "x"}"#,
+        );
         assert!(alike.contains("the id A (and a)"), "{alike}");
         assert!(refused("c.csv", "id,photos\n").contains("no column input"));
         assert!(refused("c.csv", "id,input,views\n").contains("`views` has no meaning"));

@@ -17,8 +17,8 @@ use clap::{Args, ValueEnum};
 use manifest::{Manifest, Row};
 use queue::{BatchDevice, Counts, Job, Limits, Queue};
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
-pub use row::{BatchRowArgs, batch_row};
 use row::RowKey;
+pub use row::{BatchRowArgs, batch_row};
 use serde_json::json;
 use shard::Shard;
 use std::collections::BTreeSet;
@@ -116,7 +116,8 @@ fn bound(text: &str) -> Result<Bound, String> {
 
 fn time(text: &str) -> Result<Duration, String> {
     let units = [("s", 1.0), ("m", 60.0), ("h", 3600.0)];
-    let (number, unit) = units.iter().find_map(|(u, s)| Some((text.strip_suffix(u)?, *s))).unwrap_or((text, 1.0));
+    let (number, unit) =
+        units.iter().find_map(|(u, s)| Some((text.strip_suffix(u)?, *s))).unwrap_or((text, 1.0));
     match number.parse::<f64>() {
         Ok(seconds) if seconds > 0.0 && seconds < 1e7 => Ok(Duration::from_secs_f64(seconds * unit)),
         _ => Err("give a time such as 90s, 20m or 2h".to_owned()),
@@ -194,7 +195,11 @@ fn devices(list: &[String]) -> Result<Vec<BatchDevice>> {
 }
 
 /// Keys of the rows, or why a row cannot be made; each row is read by a process of its own.
-fn check_rows(manifest: &Manifest, rows: &[&Row], progress: &dyn Progress) -> Result<Vec<Result<RowKey, Ending>>> {
+fn check_rows(
+    manifest: &Manifest,
+    rows: &[&Row],
+    progress: &dyn Progress,
+) -> Result<Vec<Result<RowKey, Ending>>> {
     let program = child::program()?;
     progress.begin("check", rows.len() as u64);
     let checked = rows.par_iter().map(|row| {
@@ -250,7 +255,8 @@ fn work(
     devices: &[BatchDevice],
     progress: &dyn Progress,
 ) -> Result<()> {
-    let events = args.shard.map_or("events.jsonl".to_owned(), |s| format!("events-{}-of-{}.jsonl", s.index, s.count));
+    let events =
+        args.shard.map_or("events.jsonl".to_owned(), |s| format!("events-{}-of-{}.jsonl", s.index, s.count));
     store.open(&events)?;
     if store.free().is_some_and(|free| free < LEAST_SPACE) {
         let source = std::io::Error::from(std::io::ErrorKind::StorageFull);
@@ -386,7 +392,8 @@ fn columns<const N: usize>(rows: &[[String; N]]) -> String {
     let widths: [usize; N] = std::array::from_fn(width);
     let mut text = String::new();
     for row in rows {
-        let cells: Vec<String> = row.iter().zip(widths).map(|(cell, width)| format!("{cell:width$}")).collect();
+        let cells: Vec<String> =
+            row.iter().zip(widths).map(|(cell, width)| format!("{cell:width$}")).collect();
         let _ = writeln!(text, "{}", cells.join("  ").trim_end());
     }
     text

@@ -186,7 +186,12 @@ impl<'a> Queue<'a> {
     }
 
     /// One attempt at a row; `false` if the user stopped it.
-    fn attempt(&self, mut waiting: Waiting<'a>, device: &BatchDevice, progress: &dyn Progress) -> Result<bool> {
+    fn attempt(
+        &self,
+        mut waiting: Waiting<'a>,
+        device: &BatchDevice,
+        progress: &dyn Progress,
+    ) -> Result<bool> {
         if waiting.claim.is_none() && !self.claim(&mut waiting)? {
             self.count(&self.elsewhere, &waiting.job.row.id, progress);
             return Ok(true);
@@ -214,7 +219,8 @@ impl<'a> Queue<'a> {
                 return Ok(false);
             }
             self.store.publish(id, &folder, &log)?;
-            self.store.event("done", json!({ "id": id, "seconds": seconds, "attempts": waiting.attempts }))?;
+            self.store
+                .event("done", json!({ "id": id, "seconds": seconds, "attempts": waiting.attempts }))?;
             self.count(&self.done, id, progress);
             return Ok(true);
         };

@@ -145,7 +145,13 @@ impl PlannedRow<'_> {
         let contents: Vec<_> = inputs.iter().map(|i| json!([i.path, i.sha256])).collect();
         let splatvk = env!("CARGO_PKG_VERSION");
         let whole = json!([
-            KEY_VERSION, splatvk, self.row.options, self.row.queries, self.row.exports, contents, models
+            KEY_VERSION,
+            splatvk,
+            self.row.options,
+            self.row.queries,
+            self.row.exports,
+            contents,
+            models
         ]);
         let key = files::hex(&Sha256::digest(whole.to_string()));
         Ok(RowKey { key, splatvk: splatvk.to_owned(), inputs, photos: found.photos.len() })

@@ -31,7 +31,9 @@ impl Shard {
             Some((index, count)) => (index, Some(number(count)?)),
             None => (text, None),
         };
-        let shard = if index == "auto" { Shard::of_array(count, variable)? } else {
+        let shard = if index == "auto" {
+            Shard::of_array(count, variable)?
+        } else {
             let count = count.ok_or("give I/N, I from 0, or auto in an array job")?;
             Shard { index: number(index)?, count }
         };
@@ -99,11 +101,8 @@ mod tests {
 
     #[test]
     fn array_jobs_name_their_part() {
-        let slurm = [
-            ("SLURM_ARRAY_TASK_ID", "5"),
-            ("SLURM_ARRAY_TASK_COUNT", "4"),
-            ("SLURM_ARRAY_TASK_MIN", "3"),
-        ];
+        let slurm =
+            [("SLURM_ARRAY_TASK_ID", "5"), ("SLURM_ARRAY_TASK_COUNT", "4"), ("SLURM_ARRAY_TASK_MIN", "3")];
         assert_eq!(read("auto", &slurm), Ok(Shard { index: 2, count: 4 }));
         let kubernetes = [("JOB_COMPLETION_INDEX", "1")];
         assert!(read("auto", &kubernetes).unwrap_err().contains("auto/N"));

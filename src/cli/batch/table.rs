@@ -129,7 +129,10 @@ fn card(row: &RowState<'_>) -> String {
     let Some(success) = &row.success else {
         let class = if row.state == "open" { "" } else { " class=\"bad\"" };
         let error = escape(&row.error);
-        return format!("<div class=\"none\"></div><p><b{class}>{id}: {}</b><br><small>{error}</small></p>", row.state);
+        return format!(
+            "<div class=\"none\"></div><p><b{class}>{id}: {}</b><br><small>{error}</small></p>",
+            row.state
+        );
     };
     let files = success["files"].as_array().into_iter().flatten();
     let mut pictures = files.filter_map(|f| f["path"].as_str()).filter(|p| p.ends_with("_render.jpg"));
@@ -140,7 +143,12 @@ fn card(row: &RowState<'_>) -> String {
     let _ = write!(card, "<a href=\"{id}/scene/report.html\">{picture}<p><b>{id}</b><br><small>");
     let figure = |field: &str| success[field].as_f64();
     let psnr = figure("psnr").map(|v| format!("{v:.1} dB · ")).unwrap_or_default();
-    let _ = write!(card, "{} photos · {psnr}{:.0} s", figure("photos").unwrap_or(0.0), figure("seconds").unwrap_or(0.0));
+    let _ = write!(
+        card,
+        "{} photos · {psnr}{:.0} s",
+        figure("photos").unwrap_or(0.0),
+        figure("seconds").unwrap_or(0.0)
+    );
     for answer in success["answers"].as_array().into_iter().flatten() {
         let text = |field: &str| escape(answer[field].as_str().unwrap_or_default());
         let _ = write!(card, "<br>{}: {}", text("text"), text("presence"));
@@ -150,7 +158,8 @@ fn card(row: &RowState<'_>) -> String {
     }
     card.push_str("</small>");
     if row.state != "done" {
-        let _ = write!(card, "<br><b class=\"bad\">{}</b><br><small>{}</small>", row.state, escape(&row.error));
+        let _ =
+            write!(card, "<br><b class=\"bad\">{}</b><br><small>{}</small>", row.state, escape(&row.error));
     }
     card.push_str("</p></a>");
     card
@@ -168,7 +177,11 @@ mod tests {
             "warnings": ["a & b"], "files": [{ "path": "scene/previews/x_render.jpg" }],
         });
         let row = |id, state, success, error: &str| RowState { id, state, success, error: error.to_owned() };
-        vec![row("a", "done", Some(success), ""), row("b", "refused", None, "no \"overlap\", <x>"), row("c", "open", None, "")]
+        vec![
+            row("a", "done", Some(success), ""),
+            row("b", "refused", None, "no \"overlap\", <x>"),
+            row("c", "open", None, ""),
+        ]
     }
 
     #[test]

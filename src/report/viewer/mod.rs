@@ -139,7 +139,8 @@ impl Scene3d<'_> {
     /// sends questions to that page, which answers them.
     pub fn framed(&self, most: usize, asks: bool) -> Result<String> {
         let packed = pack(self.splats, self.seen, self.backdrop, self.language, most)?;
-        let mut manifest = self.manifest("This view answers no questions; ask in Python: scene.query(text).")?;
+        let mut manifest =
+            self.manifest("This view answers no questions; ask in Python: scene.query(text).")?;
         manifest["live"] = asks.into();
         manifest["framed"] = true.into();
         let data = STANDARD.encode(&packed.bytes);

@@ -35,7 +35,9 @@ impl Stage for TrainColour {
         let (targets, coverage) = shared::targets(&placed.photos);
         let photos = shared::posed(&targets, &geometry.cameras, depths, &coverage);
         let options = &self.options;
-        let train = |progress: &dyn Progress| fit::train_photos(context.device, photos, &geometry.points, options, progress);
+        let train = |progress: &dyn Progress| {
+            fit::train_photos(context.device, photos, &geometry.points, options, progress)
+        };
         let Some(preview) = &self.preview else { return train(context.progress) };
         let renewals = Renewals::new();
         std::thread::scope(|scope| {
