@@ -1,3 +1,4 @@
+#![allow(clippy::unwrap_used)] // a panic is how a test fails
 use super::*;
 use std::fs;
 
