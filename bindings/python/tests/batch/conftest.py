@@ -5,6 +5,7 @@ import signal
 from pathlib import Path
 
 import pytest
+import s3_server
 
 FAKE = Path(__file__).with_name("fake_splatvk")
 
@@ -15,7 +16,6 @@ def fake(tmp_path_factory, monkeypatch):
     state = tmp_path_factory.mktemp("state")
     monkeypatch.setenv("SPLATVK_PROGRAM", str(FAKE))
     monkeypatch.setenv("FAKE_SPLATVK_STATE", str(state))
-    monkeypatch.delenv("FAKE_SPLATVK_MISSING", raising=False)
     return state
 
 
@@ -34,26 +34,15 @@ def photos(tmp_path):
 
 
 @pytest.fixture(scope="session")
-def s3_server():
+def s3():
     """A server of S3 on loopback, with the bucket `scenes`."""
-    server_of = pytest.importorskip("moto.server").ThreadedMotoServer
+    pytest.importorskip("moto.server")
     s3fs = pytest.importorskip("s3fs")
-    server = server_of(ip_address="127.0.0.1", port=0, verbose=False)
-    server.start()
-    host, port = server.get_host_and_port()
-    values = {
-        "AWS_ENDPOINT_URL": f"http://{host}:{port}",
-        "AWS_ACCESS_KEY_ID": "test",
-        "AWS_SECRET_ACCESS_KEY": "test",
-        "AWS_DEFAULT_REGION": "us-east-1",
-    }
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
-    s3fs.S3FileSystem().mkdir("scenes")
-    yield "s3://scenes"
-    for name, value in before.items():
-        os.environ.pop(name) if value is None else os.environ.update({name: value})
-    server.stop()
+    with s3_server.served() as values, pytest.MonkeyPatch.context() as patch:
+        for name, value in values.items():
+            patch.setenv(name, value)
+        s3fs.S3FileSystem().mkdir("scenes")
+        yield "s3://scenes"
 
 
 @pytest.fixture(params=["folder", "s3", "memory"])
@@ -62,7 +51,7 @@ def place(request, tmp_path):
     if request.param == "folder":
         return str(tmp_path / "out")
     if request.param == "s3":
-        return f"{request.getfixturevalue('s3_server')}/{tmp_path.name}"
+        return f"{request.getfixturevalue('s3')}/{tmp_path.name}"
     pytest.importorskip("fsspec")
     return f"memory://{tmp_path.name}"
 

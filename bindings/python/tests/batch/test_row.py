@@ -79,7 +79,7 @@ def test_result_of_one_machine_is_replaced(row, scratch, tmp_path):
     whole(str(place))
 
 
-def test_remote_inputs_are_fetched(row, photos, scratch, tmp_path, s3_server):
+def test_remote_inputs_are_fetched(row, photos, scratch, tmp_path, s3):
     import s3fs
 
     fs, base = s3fs.S3FileSystem(), f"scenes/{tmp_path.name}/photos/shop"

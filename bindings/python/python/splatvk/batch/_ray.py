@@ -12,7 +12,7 @@ from ray.exceptions import RayError, RayTaskError
 
 from .. import __version__
 from ..errors import MissingError
-from ._kinds import RETRIED, Failure, delay, smaller
+from ._kinds import RETRIED, Failure, delay
 from ._look import Looker
 from ._manifest import Row
 from ._record import Events, Summary
@@ -48,7 +48,6 @@ class Job:
     source: dict[str, Any] | None = None
     attempts: int = 0
     tries: int = 0
-    max_size: int | None = None
 
 
 @dataclass
@@ -190,11 +189,8 @@ class Engine:
             "lease": options.lease,
             "scratch": options.scratch,
             "device": options.device,
-            "max_size": job.max_size,
         }
-        gpus = options.gpus or 0.0
-        # After memory ran out a row gets a card for itself.
-        needs: dict[str, Any] = {"num_gpus": max(1.0, gpus) if gpus and job.max_size else gpus, "num_cpus": options.cpus}
+        needs: dict[str, Any] = {"num_gpus": options.gpus, "num_cpus": options.cpus}
         if self._excluded:
             needs["label_selector"] = {"ray.io/node-id": f"!in({','.join(sorted(self._excluded))})"}
         ref = self._work.options(name=f"splatvk {job.row['id']}", **needs).remote(
@@ -218,6 +214,8 @@ class Engine:
         return {"state": "failed", **failure.record()}
 
     def _settle(self, job: Job, outcome: Outcome) -> None:
+        # A row whose memory ran out was tried twice by its task.
+        job.attempts += outcome.get("attempts", 1) - 1
         outcome.update(id=job.row["id"], attempts=job.attempts)
         # A lost worker has not told it.
         outcome["source"] = outcome.get("source") or job.source
@@ -229,10 +227,7 @@ class Engine:
         if kind in ("missing", "unwritable") and self._miss(outcome):
             # The node's fault alone.
             job.tries -= 1
-        if kind == "memory" and job.max_size is None:
-            job.max_size = smaller(job.row["options"])
-            self._again(job, outcome, 0.0)
-        elif kind in RETRIED and job.tries <= self._options.retries:
+        if kind in RETRIED and job.tries <= self._options.retries:
             self._again(job, outcome, delay(max(1, job.tries)))
         else:
             self._close(outcome)
@@ -263,7 +258,6 @@ class Engine:
             kind=outcome["kind"],
             message=outcome["message"],
             attempt=job.attempts,
-            max_size=job.max_size,
             node=outcome.get("node"),
         )
 

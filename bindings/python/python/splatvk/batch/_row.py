@@ -39,7 +39,6 @@ def run_row(
     retries: int = 0,
     lease: float = 3600.0,
     scratch: str | None = None,
-    max_size: int | None = None,
     record: bool = True,
 ) -> Outcome:
     """Makes the result of one row in `out`, unless it is there; never raises for a row that fails.
@@ -58,13 +57,12 @@ def run_row(
     timeout : float, optional
         Seconds that the program may take.
     retries : int
-        How often a row is tried again whose machine failed, not the row itself.
+        How often a row is tried again whose machine failed, not the row itself. After memory of
+        the device ran out it is tried once more in any case, with smaller images.
     lease : float
         Seconds that the upload may take. Later its attempt counts as abandoned.
     scratch : str, optional
         Folder for temporary files of this machine, else the system's.
-    max_size : int, optional
-        Size of the working images instead of the row's, after memory ran out.
     record : bool
         Whether a failure is written to `_failed/ID.json`.
 
@@ -77,6 +75,7 @@ def run_row(
     checked = row_of(dict(row), base=os.getcwd())
     begin = time.monotonic()
     attempts = 0
+    max_size: int | None = None
     while True:
         attempts += 1
         outcome = _attempt(checked, out, device, timeout, lease, scratch, max_size)
@@ -86,7 +85,7 @@ def run_row(
             break
         if outcome["kind"] == "memory" and max_size is None:
             max_size = smaller(checked["options"])
-        elif outcome["kind"] not in RETRIED or attempts > retries:
+        elif outcome["kind"] not in RETRIED or attempts - (max_size is not None) > retries:
             break
         else:
             time.sleep(delay(attempts))
