@@ -90,7 +90,7 @@ def test_shards_part_the_rows(tmp_path):
             (2, 3),
         ),
         ({"JOB_COMPLETION_INDEX": "3", "SPLATVK_SHARDS": "8"}, (3, 8)),
-        ({"AWS_BATCH_JOB_ARRAY_INDEX": "0", "SPLATVK_SHARDS": "8"}, (0, 8)),
+        ({"AWS_BATCH_JOB_ARRAY_INDEX": "0", "AWS_BATCH_JOB_ARRAY_SIZE": "8"}, (0, 8)),
         ({"BATCH_TASK_INDEX": "1", "BATCH_TASK_COUNT": "2"}, (1, 2)),
     ],
 )

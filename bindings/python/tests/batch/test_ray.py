@@ -2,7 +2,7 @@
 
 import csv
 import json
-import os
+import secrets
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +18,8 @@ def cluster(tmp_path_factory):
     from ray.cluster_utils import Cluster
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_AUTH_MODE", "disabled")
+        patch.setenv("RAY_AUTH_MODE", "token")
+        patch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(24))
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("SPLATVK_PROGRAM", str(Path(__file__).with_name("fake_splatvk")))
         patch.setenv("FAKE_SPLATVK_STATE", str(tmp_path_factory.mktemp("state")))

@@ -152,6 +152,27 @@ THREADED = (
 )
 
 
+KILLED_BEFORE_COMMIT = "import os; from splatvk.batch import _row; _row.commit = lambda *_: os.kill(os.getpid(), 9); " + WORKER
+
+
+def test_kill_before_success_is_mended(row, scratch, tmp_path, processes):
+    out = str(tmp_path / "out")
+    argv = [sys.executable, "-c", KILLED_BEFORE_COMMIT, json.dumps(row), out, str(scratch)]
+    assert subprocess.run(argv).returncode == -signal.SIGKILL
+    eventually(lambda: processes() == [] and os.listdir(scratch) == [])
+    store = open_store(out)
+    (abandoned,) = store.names("shop")
+    assert run_row(row, out, scratch=str(scratch))["state"] == "done"
+    # Its lease is not over: it may be an upload under way.
+    assert _results.sweep(store, "shop", store.names("shop")) == 0
+    assert abandoned in store.names("shop")
+    later = time.time() + 3600 + _results.GRACE + 1
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_results.time, "time", lambda: later)
+        assert _results.sweep(store, "shop", store.names("shop")) == 1
+    whole(out)
+
+
 @pytest.mark.parametrize("code", [WORKER, THREADED])
 def test_killed_worker_leaves_nothing(row, scratch, tmp_path, processes, code):
     row["options"] = {"hang": 1, "child": 1}

@@ -1,6 +1,8 @@
 """`splatvk batch --engine ray`, which is `python -m splatvk.batch`."""
 
 import argparse
+import contextlib
+import os
 import signal
 import statistics
 import sys
@@ -131,8 +133,10 @@ def _drive(
     signal.signal(signal.SIGTERM, _interrupt)
     try:
         events.write("begin", rows=total, out=store.address)
-        engine.connect()
-        engine.run()
+        # Ray prints pages about each lost worker there; the events have a line.
+        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+            engine.connect()
+            engine.run()
         code = 3 if engine.missing else 1 if engine.counts.failed + engine.counts.known or engine.stopped else 0
     except KeyboardInterrupt:
         code = 130

@@ -23,6 +23,8 @@ from collections.abc import Iterator
 from typing import Any
 
 PR_SET_PDEATHSIG = 1
+#: Held while the keeper lives: a folder whose lock is free is a leftover.
+LOCK = ".lock"
 
 
 def _libc() -> Any:
@@ -30,6 +32,25 @@ def _libc() -> Any:
         return ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
     except OSError:
         return None
+
+
+def remove(folder: str) -> None:
+    """Deletes a scratch folder, its lock last: a folder that is half deleted when this process is
+    killed can still be told from one that is in use."""
+    try:
+        entries = os.listdir(folder)
+    except OSError:
+        return
+    for name in entries:
+        path = os.path.join(folder, name)
+        if os.path.isdir(path):
+            shutil.rmtree(path, ignore_errors=True)
+        elif name != LOCK:
+            try:
+                os.unlink(path)
+            except OSError:
+                pass
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _start(request: dict[str, Any], libc: Any) -> int:
@@ -105,8 +126,7 @@ def main(folder: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
-    # Held while this process lives: a folder whose lock is free is a leftover.
-    lock = os.open(os.path.join(folder, ".lock"), os.O_RDWR | os.O_CREAT, 0o644)
+    lock = os.open(os.path.join(folder, LOCK), os.O_RDWR | os.O_CREAT, 0o644)
     fcntl.flock(lock, fcntl.LOCK_EX)
     os.write(1, b"{}\n")
     libc = _libc()
@@ -124,7 +144,7 @@ def main(folder: str) -> None:
             os.write(1, (json.dumps({"exit_code": code, "timed_out": how == "timeout"}) + "\n").encode())
         except BrokenPipeError:
             break
-    shutil.rmtree(folder, ignore_errors=True)
+    remove(folder)
 
 
 if __name__ == "__main__":

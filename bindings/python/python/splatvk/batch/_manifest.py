@@ -146,10 +146,10 @@ def shard_of(text: str) -> tuple[int, int]:
         first, step = int(env["SLURM_ARRAY_TASK_MIN"]), int(env.get("SLURM_ARRAY_TASK_STEP") or 1)
         place = (int(env["SLURM_ARRAY_TASK_ID"]) - first) // step
         return place, int(env["SLURM_ARRAY_TASK_COUNT"])
-    # Each manager's index, and its number of tasks: AWS and Kubernetes do not set that one.
+    # Each manager's index, and its number of tasks, which Kubernetes does not set.
     for index, count in (
         ("BATCH_TASK_INDEX", "BATCH_TASK_COUNT"),
-        ("AWS_BATCH_JOB_ARRAY_INDEX", "SPLATVK_SHARDS"),
+        ("AWS_BATCH_JOB_ARRAY_INDEX", "AWS_BATCH_JOB_ARRAY_SIZE"),
         ("JOB_COMPLETION_INDEX", "SPLATVK_SHARDS"),
     ):
         if index in env:

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 
 from ..errors import MissingError
+from ._keeper import LOCK, remove
 
 _PREFIX = "splatvk-batch-"
 #: A folder without a lock is a leftover after this time; a keeper takes its lock within a second.
@@ -50,7 +51,7 @@ def clear_scratch(root: Path) -> None:
     """Deletes scratch folders whose keepers are gone."""
     for folder in root.glob(_PREFIX + "*"):
         try:
-            handle = os.open(folder / ".lock", os.O_RDWR)
+            handle = os.open(folder / LOCK, os.O_RDWR)
         except OSError:
             try:
                 if time.time() - folder.stat().st_mtime > _UNLOCKED_SECONDS:
@@ -60,7 +61,7 @@ def clear_scratch(root: Path) -> None:
             continue
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(folder, ignore_errors=True)
+            remove(str(folder))
         except OSError:
             pass
         finally:
@@ -100,7 +101,7 @@ class Keeper:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        shutil.rmtree(self.scratch, ignore_errors=True)
+        remove(str(self.scratch))
 
     def _answer(self) -> dict[str, object]:
         line = self._process.stdout.readline() if self._process.stdout else ""

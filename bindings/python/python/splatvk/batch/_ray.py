@@ -120,6 +120,7 @@ class Engine:
             f"cluster {context.address_info['gcs_address']}: {len(alive)} nodes, "
             f"{options.gpus:g} GPUs and {options.cpus:g} processors a row",
             address=context.address_info["gcs_address"],
+            job=ray.get_runtime_context().get_job_id(),
             nodes=len(alive),
             gpus_per_row=options.gpus,
             cpus_per_row=options.cpus,
