@@ -392,8 +392,8 @@ typedef struct {
      */
     size_t size;
     /*
-     Part of the name of a Vulkan device, or its number as a text; NULL = the best device. Not
-     for svk_context_adopt.
+     Vulkan device: "uuid:…", "pci:…", its number as a text, or a part of its name; NULL = the
+     best device. Not for svk_context_adopt.
      */
     const char *device;
     /*

@@ -16,11 +16,11 @@ fn photos() -> String {
     format!("{}/tests/data/breakfast/images", env!("CARGO_MANIFEST_DIR"))
 }
 
-/// Returns the only error line of a run that must be refused with exit code 2.
+/// Returns the only error line of a run that must be refused with exit code 3: a part is missing or unusable.
 fn refusal(args: &[&str], set: &[(&str, &str)]) -> String {
     let (code, _, stderr) = splatvk(args, set);
     let lines: Vec<&str> = stderr.lines().filter(|l| l.starts_with("splatvk: ")).collect();
-    assert!(code == 2 && lines.len() == 1 && !stderr.contains("panicked"), "{code}: {stderr}");
+    assert!(code == 3 && lines.len() == 1 && !stderr.contains("panicked"), "{code}: {stderr}");
     lines[0].to_string()
 }
 
@@ -105,7 +105,7 @@ fn unusable_onnx_runtime_is_named() {
 fn unknown_provider_of_environment_is_refused() {
     let (code, stdout, _) = splatvk(&["doctor", "--json"], &[("SPLATVK_PROVIDER", "gpu")]);
     assert!(
-        code == 2 && stdout.contains("provider gpu: unknown; choose one of auto, cpu"),
+        code == 3 && stdout.contains("provider gpu: unknown; choose one of auto, cpu"),
         "{code}: {stdout}"
     );
 }

@@ -149,7 +149,7 @@ fn full_disk_run_resumes_later() {
         return;
     }
     let log = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(output.status.code(), Some(2), "{log}");
+    assert_eq!(output.status.code(), Some(4), "{log}");
     let last: Value = serde_json::from_str(log.lines().last().unwrap()).unwrap();
     let message = last["message"].as_str().unwrap();
     assert!(last["event"] == "error" && message.contains("cannot be written"), "{log}");

@@ -101,7 +101,7 @@ fn training_resumes_bitwise_after_lost_device() {
         let (error, steps) = train(&lost, &kept());
         let error = error.unwrap_err();
         let Error::DeviceLost { kept: Some(kept), .. } = &error else { panic!("{error:?}") };
-        assert!(error.source().is_some() && error.exit_code() == 1);
+        assert!(error.source().is_some() && error.exit_code() == 5);
         let text = error.to_string();
         assert!(text.contains("the device was lost") && text.contains("--resume"), "{text}");
         assert!(!text.contains('\n') && text.ends_with(kept), "{text}");
@@ -144,7 +144,7 @@ fn training_resumes_bitwise_after_out_of_memory() {
         let Error::OutOfDeviceMemory { kept: Some(kept), doing, .. } = &error else { panic!("{error:?}") };
         let text = error.to_string();
         assert!(text.ends_with(kept) && text.contains("--resume") && text.contains("fewer splats"), "{text}");
-        assert!(doing.contains("buffer") && error.exit_code() == 1 && error.source().is_some(), "{text}");
+        assert!(doing.contains("buffer") && error.exit_code() == 5 && error.source().is_some(), "{text}");
         stages.push(kept.clone());
         // The device works again once it has memory.
         full.exhaust_after(u64::MAX / 2);

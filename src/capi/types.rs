@@ -161,8 +161,8 @@ pub enum SvkPresence {
 pub struct SvkContextOptions {
     /// sizeof(SvkContextOptions)
     pub size: usize,
-    /// Part of the name of a Vulkan device, or its number as a text; NULL = the best device. Not
-    /// for svk_context_adopt.
+    /// Vulkan device: "uuid:…", "pci:…", its number as a text, or a part of its name; NULL = the
+    /// best device. Not for svk_context_adopt.
     pub device: *const c_char,
     /// Folder of the models; NULL = the installed ones.
     pub models: *const c_char,

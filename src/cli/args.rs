@@ -6,6 +6,9 @@ use std::path::PathBuf;
 mod bench;
 mod shared;
 
+#[cfg(unix)]
+pub use super::batch::{BatchArgs, BatchRowArgs};
+pub use super::demo::DemoArgs;
 pub use super::export::ExportArgs;
 pub use super::measure::MeasureArgs;
 pub use super::run::RunArgs;
@@ -49,6 +52,15 @@ pub enum Command {
     Models(ModelsArgs),
     /// How fast this machine trains and renders
     Bench(BenchArgs),
+    /// Many captures → a scene each, resumable, on all devices
+    #[cfg(unix)]
+    Batch(BatchArgs),
+    /// One attempt at a row of a batch, which is on standard input
+    #[cfg(unix)]
+    #[command(hide = true)]
+    BatchRow(BatchRowArgs),
+    /// Four photos that come with the program → a scene, in the browser
+    Demo(DemoArgs),
     /// What this machine has and what is missing
     Doctor(DoctorArgs),
     /// What earlier runs left to be used again: shows it, or frees it
@@ -88,6 +100,7 @@ impl Command {
                 }
                 ModelsAction::Fetch(args) => &mut args.device,
             },
+            Command::Demo(args) => &mut args.device,
             Command::Doctor(args) => &mut args.device,
             Command::Bench(args) => return Some(&mut args.provider),
             Command::Render(_)
@@ -98,6 +111,8 @@ impl Command {
             | Command::Clean(_)
             | Command::Completions(_)
             | Command::Manuals(_) => return None,
+            #[cfg(unix)]
+            Command::Batch(_) | Command::BatchRow(_) => return None,
         };
         Some(&mut device.provider)
     }

@@ -61,20 +61,21 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
     let Support { found, advice } = photo::video_support();
     lines.push(line("video", if advice.is_some() { Status::Note } else { Status::Ok }, found, advice));
     let missing = lines.iter().filter(|l| l.status == Status::Missing).count();
+    let next = next(&lines);
     if args.device.json {
         let lines: Vec<_> = lines
             .iter()
             .map(|l| json!({ "topic": l.topic, "status": word(l.status), "found": l.found, "advice": l.advice }))
             .collect();
         let models: Vec<_> = status.iter().map(models::to_json).collect();
-        print_json(&json!({ "ready": missing == 0, "lines": lines, "models": models }))?;
+        print_json(&json!({ "ready": missing == 0, "next": next, "lines": lines, "models": models }))?;
     } else {
-        print(&table(&lines))?;
+        print(&format!("{}\nnext: {next}\n", table(&lines)))?;
     }
     match missing {
         0 => Ok(()),
         n => Err(Error::missing(format!(
-            "{n} required parts are missing; follow the advice above, tools/setup does it all"
+            "{n} required parts are missing; next: {next}"
         ))),
     }
 }
@@ -158,6 +159,24 @@ fn word(status: Status) -> &'static str {
         Status::Ok => "ok",
         Status::Note => "note",
         Status::Missing => "MISSING",
+    }
+}
+
+/// The command to run next: it mends the first missing part, or makes a first scene.
+fn next(lines: &[Line]) -> &'static str {
+    let missing = |topic: &str| lines.iter().any(|l| l.status == Status::Missing && l.topic.starts_with(topic));
+    let in_python = || {
+        let program = std::env::current_exe().unwrap_or_default();
+        program.file_name().is_some_and(|name| name.to_string_lossy().starts_with("python"))
+    };
+    if missing("Vulkan") {
+        "sudo apt install libvulkan1 mesa-vulkan-drivers"
+    } else if missing("ONNX Runtime") || missing("model") {
+        if in_python() { "pip install --force-reinstall splatvk splatvk-models" } else { "tools/setup" }
+    } else if lines.iter().any(|l| l.status == Status::Missing) {
+        "follow the advice above"
+    } else {
+        "splatvk demo"
     }
 }
 

@@ -131,6 +131,12 @@ fn transform_scene(scene: &mut Scene, points: &mut Option<PointCloud>, by: &Simi
 }
 
 pub fn export(args: &ExportArgs) -> Result<()> {
+    write(args)?;
+    listing(std::slice::from_ref(&args.out), args.json)
+}
+
+/// Writes the file or the folder of an export.
+pub fn write(args: &ExportArgs) -> Result<()> {
     let format = format(args)?;
     let out = Output::reserve(args, format)?;
     let mut scene = scene::load(&args.scene)?;
@@ -188,7 +194,7 @@ pub fn export(args: &ExportArgs) -> Result<()> {
     if let Some(warning) = check_ending(&args.out, format)? {
         progress::reporter().warn(&warning);
     }
-    listing(std::slice::from_ref(&args.out), args.json)
+    Ok(())
 }
 
 /// Reserved output of a format.
@@ -204,7 +210,7 @@ enum Output {
 impl Output {
     /// Reserves the output, or refuses a place that may not be written, before the scene is read.
     fn reserve(args: &ExportArgs, format: &str) -> Result<Output> {
-        let is_folder = format.starts_with("colmap");
+        let is_folder = is_folder(format);
         if args.spz_version.is_some() && format != "spz" {
             return Err(Error::input("--spz-version: only --format spz has versions; leave it out"));
         }
@@ -239,8 +245,13 @@ fn endings() -> impl Iterator<Item = (&'static str, &'static str)> {
     FORMATS.iter().map(|f| (f.name, f.ending)).chain([("transforms", ".json")])
 }
 
+/// Whether a format is a folder of files.
+pub fn is_folder(format: &str) -> bool {
+    format.starts_with("colmap")
+}
+
 /// The requested format, or that of the ending of `--out`.
-fn format(args: &ExportArgs) -> Result<&str> {
+pub fn format(args: &ExportArgs) -> Result<&str> {
     if let Some(format) = &args.format {
         return Ok(format);
     }

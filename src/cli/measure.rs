@@ -24,7 +24,7 @@ pub struct MeasureArgs {
     #[arg(long, value_name = "A-B=0.21", allow_hyphen_values = true)]
     pub scale: Vec<Length>,
     /// Device, for places given in pixels
-    #[arg(long, value_name = "NAME|INDEX")]
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<String>,
     /// Print one JSON object on standard output
     #[arg(long)]

@@ -1,7 +1,10 @@
 //! Command line: arguments in [`args`], one file per command.
 pub mod args;
+#[cfg(unix)]
+mod batch;
 mod bench;
 mod clean;
+mod demo;
 mod doctor;
 pub mod eval;
 mod export;
@@ -79,7 +82,7 @@ fn start_with<P: Program>(arguments: Vec<OsString>) -> u8 {
             0
         }
         Err(error) => {
-            progress::print_error(&error.to_string(), error.exit_code());
+            progress::print_error(&error.to_string(), &error);
             error.exit_code()
         }
     }
@@ -92,6 +95,7 @@ impl Program for Cli {
         ("render", &["provider"]),
         ("measure", &["provider", "log"]),
         ("export", &["provider", "log"]),
+        ("batch", &["provider"]),
         ("clean", &["provider", "log"]),
         ("completions", &["provider", "log"]),
         ("manuals", &["provider", "log"]),
@@ -118,7 +122,12 @@ impl Program for Cli {
             Command::Export(args) => export::export(&args),
             Command::Models(args) => models::models(&args),
             Command::Bench(args) => bench::bench(&args),
+            #[cfg(unix)]
+            Command::Batch(args) => batch::batch(&args),
+            #[cfg(unix)]
+            Command::BatchRow(args) => batch::batch_row(&args),
             Command::Clean(args) => clean::clean(&args),
+            Command::Demo(args) => demo::demo(&args),
             Command::Doctor(args) => doctor::doctor(&args),
             Command::Completions(args) => shell::completions(&args),
             Command::Manuals(args) => shell::manuals(&args),

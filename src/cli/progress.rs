@@ -44,20 +44,24 @@ pub fn stopped() -> bool {
 }
 
 /// Prints the error that ends the process; of two threads that end it the first wins. Unusable
-/// input (exit code 2) drops the lines held in the first `HELD_FOR`: they concern work without a
-/// result.
-pub fn print_error(message: &str, exit_code: u8) {
+/// input, a missing part or an unwritable place (exit codes 2 to 4) drops the lines held in the
+/// first `HELD_FOR`: they concern work without a result.
+pub fn print_error(message: &str, error: &Error) {
+    let exit_code = error.exit_code();
     static PRINTED: AtomicBool = AtomicBool::new(false);
     if PRINTED.swap(true, Ordering::SeqCst) {
         return;
     }
     match exit_code {
-        2 => drop(lock(&HELD).take()),
+        2..=4 => drop(lock(&HELD).take()),
         _ => release(),
     }
     let message = one_line(message);
     match as_json() {
-        true => write_event("error", json!({ "message": message, "exit_code": exit_code })),
+        true => write_event(
+            "error",
+            json!({ "message": message, "kind": error.kind(), "exit_code": exit_code }),
+        ),
         false => write_line(&format!("{}: {message}", NAME.get().unwrap_or(&"splatvk"))),
     }
 }
@@ -216,7 +220,7 @@ fn exit_stopped() -> ! {
     let serves = SERVES.load(Ordering::SeqCst);
     let code = if serves { 0 } else { Error::Cancelled.exit_code() };
     if !serves {
-        print_error(&if nothing { Error::Cancelled.to_string() } else { kept }, code);
+        print_error(&if nothing { Error::Cancelled.to_string() } else { kept }, &Error::Cancelled);
     }
     // Exit handlers would unload libraries that threads are running in.
     #[cfg(all(target_os = "linux", target_env = "gnu"))]

@@ -5,6 +5,7 @@
 //! other users, requests that never end. All connections share one thread that blocks on none of
 //! them, so that none delays another.
 use crate::error::words;
+use crate::sync::lock;
 use crate::{Error, Result};
 use http_body_util::{BodyExt, Full, LengthLimitError, Limited};
 use hyper::body::{Body, Bytes, Incoming};
@@ -16,7 +17,7 @@ use serde_json::{Value, json};
 use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::time::Duration;
@@ -55,7 +56,7 @@ pub struct Question {
     pub reply: oneshot::Sender<Answer>,
 }
 
-/// Content of the server.
+/// Content of the server, which may change.
 pub struct Site {
     /// HTML page.
     pub page: String,
@@ -65,6 +66,31 @@ pub struct Site {
     pub scene: Vec<u8>,
     /// Whether questions are answered.
     pub answers_questions: bool,
+}
+
+/// The site of a running server.
+pub struct LiveSite(Arc<Shared>);
+
+impl LiveSite {
+    /// Another page, which an open one loads in its place.
+    pub fn replace(&self, site: Site) {
+        let mut content = lock(&self.0.content);
+        let page = content.numbers.0 + 1;
+        *content = Content::of(site);
+        content.numbers = (page, 0);
+    }
+
+    /// Another scene for the same page.
+    pub fn renew(&self, scene: Vec<u8>) {
+        let mut content = lock(&self.0.content);
+        content.scene = scene.into();
+        content.numbers.1 += 1;
+    }
+
+    /// A line for the open page.
+    pub fn say(&self, notice: &str) {
+        lock(&self.0.content).notice = notice.to_owned();
+    }
 }
 
 /// A bound port with a secret path that only this process and readers of its output know.
@@ -97,16 +123,14 @@ impl ServerAddress {
 }
 
 /// Serves in a thread of its own until the process ends; returns the receiver of the questions.
-pub fn serve(address: ServerAddress, site: Site) -> Result<Receiver<Question>> {
+pub fn serve(address: ServerAddress, site: Site) -> Result<(Receiver<Question>, LiveSite)> {
     let (sender, questions) = sync_channel(MAX_WAITING);
     let failed = |e: std::io::Error| Error::work(format!("the server cannot start: {}", words(&e)));
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().map_err(failed)?;
     let ServerAddress { listener, port, secret } = address;
     let shared = Arc::new(Shared {
-        page: site.page.into(),
-        scene_path: site.scene_path,
-        scene: site.scene.into(),
-        questions: site.answers_questions.then_some(sender),
+        content: Mutex::new(Content::of(site)),
+        questions: sender,
         hosts: hosts(port),
         secret,
     });
@@ -114,9 +138,10 @@ pub fn serve(address: ServerAddress, site: Site) -> Result<Receiver<Question>> {
         let _inside = runtime.enter();
         tokio::net::TcpListener::from_std(listener).map_err(failed)?
     };
+    let live = LiveSite(shared.clone());
     let accept_all = move || runtime.block_on(accept(&listener, &shared));
     std::thread::Builder::new().name("server".into()).spawn(accept_all).map_err(failed)?;
-    Ok(questions)
+    Ok((questions, live))
 }
 
 /// An open connection.
@@ -163,11 +188,46 @@ async fn connection(stream: TcpStream, shared: Arc<Shared>, waits: Arc<AtomicBoo
     let _ = timeout(CONNECTION, served).await;
 }
 
-struct Shared {
+struct Content {
     page: Bytes,
     scene_path: &'static str,
     scene: Bytes,
-    questions: Option<SyncSender<Question>>,
+    answers_questions: bool,
+    /// Numbers of the page, and of the scene of that page.
+    numbers: (u64, u64),
+    notice: String,
+}
+
+impl Content {
+    fn of(site: Site) -> Content {
+        Content {
+            page: site.page.into(),
+            scene_path: site.scene_path,
+            scene: site.scene.into(),
+            answers_questions: site.answers_questions,
+            numbers: (0, 0),
+            notice: String::new(),
+        }
+    }
+
+    /// The answer to a request that asks for no work.
+    fn get(&self, name: &str) -> Option<(&'static str, Bytes)> {
+        match name {
+            "" => Some(("text/html; charset=utf-8", self.page.clone())),
+            "state" => {
+                let (page, scene) = self.numbers;
+                let state = json!({ "page": page, "scene": scene, "notice": self.notice });
+                Some(("application/json", state.to_string().into()))
+            }
+            name if name == self.scene_path => Some(("application/octet-stream", self.scene.clone())),
+            _ => None,
+        }
+    }
+}
+
+struct Shared {
+    content: Mutex<Content>,
+    questions: SyncSender<Question>,
     /// Accepted values of `Host`.
     hosts: Vec<String>,
     secret: String,
@@ -217,10 +277,7 @@ impl Shared {
         let not_found = || (StatusCode::NOT_FOUND, "there is nothing here".to_owned());
         let name = self.path_after_secret(request.uri().path()).ok_or_else(not_found)?.to_owned();
         match (request.method(), name.as_str()) {
-            (&Method::GET | &Method::HEAD, "") => Ok(("text/html; charset=utf-8", self.page.clone())),
-            (&Method::GET | &Method::HEAD, name) if name == self.scene_path => {
-                Ok(("application/octet-stream", self.scene.clone()))
-            }
+            (&Method::GET | &Method::HEAD, name) => lock(&self.content).get(name).ok_or_else(not_found),
             (&Method::POST, "query") => {
                 let text = question(request).await?;
                 waits.store(true, Ordering::Relaxed);
@@ -252,12 +309,12 @@ impl Shared {
     }
 
     async fn ask(&self, text: String) -> Result<String, Refused> {
-        let questions = self.questions.as_ref();
-        let questions =
-            questions.ok_or_else(|| (StatusCode::NOT_FOUND, "this scene answers no questions".to_owned()))?;
+        if !lock(&self.content).answers_questions {
+            return Err((StatusCode::NOT_FOUND, "this scene answers no questions".to_owned()));
+        }
         let busy = |message: &str| (StatusCode::SERVICE_UNAVAILABLE, message.to_owned());
         let (reply, answer) = oneshot::channel();
-        questions
+        self.questions
             .try_send(Question { text, reply })
             .map_err(|_| busy("too many questions at once; ask again in a moment"))?;
         let answer = answer.await.map_err(|_| busy("the server is about to end"))?;

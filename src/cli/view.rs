@@ -1,102 +1,182 @@
 //! `splatvk view`: the interactive view of a scene, served to the browser of this machine.
-use super::args::ViewArgs;
+use super::args::{DeviceArgs, ViewArgs};
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
-use super::serve::{Answer, ServerAddress, Site, serve};
+use super::serve::{Answer, LiveSite, ServerAddress, Site, serve};
 use crate::format::scene_dir::Scene;
 use crate::format::scene_photos;
 use crate::gpu;
 use crate::photo;
 use crate::query::QueryOptions;
-use crate::report::viewer::{self, CodeNames, SCENE_PATH, Scene3d};
+use crate::report::viewer::{self, CodeNames, Lifetime, SCENE_PATH, Scene3d};
 use crate::run::Compat;
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
 use crate::run::preview;
+use crate::run::record;
 use crate::scene::{Camera, RgbImage};
 use crate::{Error, Result};
 use serde_json::json;
 use std::path::Path;
 use std::sync::mpsc::RecvTimeoutError;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 /// Interval at which Ctrl-C is noticed between questions.
 const POLL_INTERVAL: Duration = Duration::from_millis(100);
+/// Interval at which a preview is looked at.
+const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 
 pub fn view(args: &ViewArgs) -> Result<()> {
-    let (scene, is_preview) = load(&args.scene)?;
-    if scene.splats.is_empty() {
-        return Err(Error::input(format!("{}: no splats to show", args.scene.display())));
-    }
-    // The port is bound first: one that is in use is reported before the scene is prepared.
-    let server = ServerAddress::bind(args.port)?;
-    let (mut ready, no_questions) = match query_scene(&scene, args) {
-        _ if is_preview => (None, Some("words come with the finished scene".to_owned())),
-        Ok(ready) => (Some(ready), None),
-        Err(error) => (None, Some(error.to_string())),
-    };
-    if let Some(reason) = no_questions.as_deref().filter(|_| scene.language.is_some()) {
-        progress::reporter().warn(&format!("no questions: {reason}"));
-    }
-    let options = Compat::answers(None, &args.scene)?;
-    let names = ready.as_mut().map_or(Ok(CodeNames::new()), QueryScene::names)?;
-    let site = Site {
-        page: page(&scene, args, &names, no_questions.as_deref(), is_preview)?,
-        scene_path: SCENE_PATH,
-        scene: viewer::pack(
-            &scene.splats,
-            &scene.seen,
-            &scene.backdrop,
-            scene.language.as_ref(),
-            usize::MAX,
-        )?
-        .bytes,
-        answers_questions: ready.is_some(),
-    };
-    let address = server.url();
-    let questions = serve(server, site)?;
-    // From here on stopping leaves nothing undone. Whoever reads the address may stop the server.
-    progress::stop_without_error();
-    if args.device.json {
-        print_json(&json!({
-            "address": address, "scene": args.scene, "questions": ready.is_some(), "preview": is_preview,
-        }))?;
-    } else {
-        let what = if is_preview { "a preview of " } else { "" };
-        print(&format!("{what}{} is at {address}  (Ctrl-C ends)\n", args.scene.display()))?;
-    }
-    let input = StandardInput::new();
-    while !progress::stopped() && !input.has_closed() {
-        match questions.recv_timeout(POLL_INTERVAL) {
-            // The page was closed while its question waited.
-            Ok(question) if question.reply.is_closed() => {}
-            Ok(question) => {
-                let answer = reply(ready.as_mut(), &question.text, &options);
-                let _ = question.reply.send(answer);
-            }
-            Err(RecvTimeoutError::Timeout) => {}
-            // Without questions the server has no sender.
-            Err(RecvTimeoutError::Disconnected) => std::thread::sleep(POLL_INTERVAL),
-        }
-    }
-    Ok(())
+    let ViewArgs { scene, port, device } = args;
+    Shown::open(scene, *port, device, &[])?.serve(device.json, &|_| Ok(()))
 }
 
-/// Loads the preview of a scene that a run is making, or the scene; and whether it is a preview.
-fn load(path: &Path) -> Result<(Scene, bool)> {
-    // The run may end at this moment and take its preview away.
-    match preview::of_running(path).map(|preview| scene::load(&preview)) {
-        Some(Ok(scene)) => Ok((scene, true)),
-        _ => Ok((scene::load(path)?, false)),
+/// A scene that is prepared to be served.
+pub struct Shown<'a> {
+    path: &'a Path,
+    device: &'a DeviceArgs,
+    /// Queries that the page offers.
+    suggested: &'a [String],
+    server: ServerAddress,
+    prepared: Prepared,
+}
+
+/// A site, and the state behind it.
+struct Prepared {
+    site: Site,
+    ready: Option<QueryScene>,
+    /// Time stamp of a preview; `None` for a finished scene.
+    preview: Option<SystemTime>,
+}
+
+impl<'a> Shown<'a> {
+    /// Loads a scene, or the preview of one that a run is making.
+    ///
+    /// # Errors
+    /// A port that is in use, and a scene that cannot be read or has no splats.
+    pub fn open(path: &'a Path, port: u16, device: &'a DeviceArgs, suggested: &'a [String]) -> Result<Self> {
+        // The port is bound first: one that is in use is reported before the scene is prepared.
+        let server = ServerAddress::bind(port)?;
+        let prepared = Prepared::load(path, device, suggested)?;
+        Ok(Shown { path, device, suggested, server, prepared })
     }
+
+    /// Address of the page.
+    pub fn url(&self) -> String {
+        self.server.url()
+    }
+
+    /// Serves until the user or the parent process ends it. `each` is called between questions.
+    pub fn serve(self, as_json: bool, each: &dyn Fn(&LiveSite) -> Result<()>) -> Result<()> {
+        let Shown { path, device, suggested, server, prepared } = self;
+        let Prepared { site, mut ready, mut preview } = prepared;
+        let options = Compat::answers(None, path)?;
+        let (address, answers) = (server.url(), site.answers_questions);
+        let (questions, live) = serve(server, site)?;
+        // From here on stopping leaves nothing undone. Whoever reads the address may stop the
+        // server.
+        progress::stop_without_error();
+        if as_json {
+            print_json(&json!({
+                "address": address, "scene": path, "questions": answers, "preview": preview.is_some(),
+            }))?;
+        } else {
+            let what = if preview.is_some() { "a preview of " } else { "" };
+            print(&format!("{what}{} is at {address}  (Ctrl-C ends)\n", path.display()))?;
+        }
+        let input = StandardInput::new();
+        let mut looked = Instant::now();
+        while !progress::stopped() && !input.has_closed() {
+            match questions.recv_timeout(POLL_INTERVAL) {
+                // The page was closed while its question waited.
+                Ok(question) if question.reply.is_closed() => {}
+                Ok(question) => {
+                    let answer = reply(ready.as_mut(), &question.text, &options);
+                    let _ = question.reply.send(answer);
+                }
+                Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {}
+            }
+            each(&live)?;
+            if preview.is_none() || looked.elapsed() < LOOK_INTERVAL {
+                continue;
+            }
+            looked = Instant::now();
+            match stamp(path) {
+                Some(stamp) if Some(stamp) == preview => {}
+                Some(stamp) => {
+                    // A preview that is replaced at this moment comes with the next look.
+                    let packed = preview::of_running(path).map(|p| scene::load(&p).and_then(|s| pack(&s)));
+                    if let Some(Ok(packed)) = packed {
+                        live.renew(packed);
+                        preview = Some(stamp);
+                    }
+                }
+                // The run is over; without a scene the preview stays.
+                None if path.exists() => {
+                    let last = Prepared::load(path, device, suggested)?;
+                    live.replace(last.site);
+                    (ready, preview) = (last.ready, last.preview);
+                }
+                None => live.say("The run ended without a scene."),
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Time stamp of the preview of a scene that a run is making.
+fn stamp(scene: &Path) -> Option<SystemTime> {
+    preview::of_running(scene)?.join("scene.json").metadata().ok()?.modified().ok()
+}
+
+impl Prepared {
+    fn load(path: &Path, device: &DeviceArgs, suggested: &[String]) -> Result<Prepared> {
+        let preview = stamp(path);
+        // The run may end at this moment and take its preview away.
+        let running = preview.and_then(|_| scene::load(&preview::of_running(path)?).ok());
+        let preview = preview.filter(|_| running.is_some());
+        let scene = running.map_or_else(|| scene::load(path), Ok)?;
+        if scene.splats.is_empty() {
+            return Err(Error::input(format!("{}: no splats to show", path.display())));
+        }
+        let (mut ready, no_questions) = match query_scene(&scene, device) {
+            _ if preview.is_some() => (None, Some("words come with the finished scene".to_owned())),
+            Ok(ready) => (Some(ready), None),
+            Err(error) => (None, Some(error.to_string())),
+        };
+        if let Some(reason) = no_questions.as_deref().filter(|_| scene.language.is_some()) {
+            progress::reporter().warn(&format!("no questions: {reason}"));
+        }
+        let names = ready.as_mut().map_or(Ok(CodeNames::new()), QueryScene::names)?;
+        let suggested = match &ready {
+            None => Vec::new(),
+            Some(_) if suggested.is_empty() => queries_of_run(path),
+            Some(_) => suggested.to_vec(),
+        };
+        let lifetime = if preview.is_some() { Lifetime::Preview } else { Lifetime::Final };
+        let page = page(&scene, path, &names, suggested, (no_questions.as_deref(), lifetime))?;
+        let site =
+            Site { page, scene_path: SCENE_PATH, scene: pack(&scene)?, answers_questions: ready.is_some() };
+        Ok(Prepared { site, ready, preview })
+    }
+}
+
+/// Queries of the run that made a scene.
+fn queries_of_run(scene: &Path) -> Vec<String> {
+    record::read(scene, "").map(|record| record.config.plan.inputs.queries).unwrap_or_default()
+}
+
+fn pack(scene: &Scene) -> Result<Vec<u8>> {
+    let language = scene.language.as_ref();
+    Ok(viewer::pack(&scene.splats, &scene.seen, &scene.backdrop, language, usize::MAX)?.bytes)
 }
 
 /// Prepares the scene for questions in its own views.
-fn query_scene(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
+fn query_scene(scene: &Scene, device: &DeviceArgs) -> Result<QueryScene> {
     let field = scene.language.clone().ok_or_else(|| Error::input("this scene has no language"))?;
-    let encoder = encoder::of_scene(scene, args.device.registry()?)?;
-    let device = gpu::open(args.device.device.as_deref())?;
+    let encoder = encoder::of_scene(scene, device.registry()?)?;
+    let device = gpu::open(device.device.as_deref())?;
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
     ready.set_views(&scene.cameras)?;
     Ok(ready)
@@ -104,16 +184,16 @@ fn query_scene(scene: &Scene, args: &ViewArgs) -> Result<QueryScene> {
 
 fn page(
     scene: &Scene,
-    args: &ViewArgs,
+    path: &Path,
     names: &CodeNames,
-    no_questions: Option<&str>,
-    is_preview: bool,
+    suggested: Vec<String>,
+    (no_questions, lifetime): (Option<&str>, Lifetime),
 ) -> Result<String> {
     // Photos are optional: a scene without its images, or with images elsewhere, is still shown.
     let load = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
     let photos: Option<Vec<_>> = scene.cameras.iter().map(load).collect();
     let images: Vec<RgbImage> = photos.unwrap_or_default().into_iter().map(|p| p.image).collect();
-    let path = args.scene.canonicalize().unwrap_or_else(|_| args.scene.clone());
+    let path = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     let title = path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     let view = Scene3d {
         title: &title,
@@ -126,16 +206,16 @@ fn page(
         language: scene.language.as_ref(),
         names,
         answers: Vec::new(),
+        suggested,
     };
-    let notice = "A preview: the scene is still being made. Open it again when the run is done.";
-    view.served(no_questions, is_preview.then_some(notice))
+    view.served(no_questions, lifetime)
 }
 
 fn reply(ready: Option<&mut QueryScene>, text: &str, options: &QueryOptions) -> Answer {
     let ready = ready.ok_or_else(|| (404, "this scene answers no questions".to_owned()))?;
     let clock = Instant::now();
     let answers =
-        ready.ask(text, options).map_err(|e| (if e.exit_code() == 2 { 422 } else { 500 }, e.to_string()))?;
+        ready.ask(text, options).map_err(|e| (if (2..=3).contains(&e.exit_code()) { 422 } else { 500 }, e.to_string()))?;
     let mut reply = answers.shown().json();
     reply["milliseconds"] = (1e3 * clock.elapsed().as_secs_f64()).into();
     Ok(reply.to_string())

@@ -178,6 +178,10 @@ pub(super) fn train<T: Training>(
         if progress.checkpoint().is_some_and(Checkpoint::due) {
             save(run, step, progress)?;
         }
+        if progress.wants_splats() {
+            let Trainer { model, cameras, .. } = run.trainer();
+            progress.splats(model.splats()?, cameras);
+        }
     }
     run.trainer().model.check(iterations)
 }

@@ -4,8 +4,8 @@ use crate::Error;
 use splatvk_gpu::{Cache, Device, Options};
 use std::sync::Arc;
 
-/// Opens the preferred device with [`options`], or the one with `choice` as its index or a part of
-/// its name.
+/// Opens the preferred device with [`options`], or the one that `choice` names
+/// ([`Options::choice`]).
 ///
 /// # Errors
 /// Those of [`Device::open`], and where `SPLATVK_DISABLE` names no kernel variant.
@@ -33,7 +33,8 @@ fn check_disabled(options: &Options) -> crate::Result<()> {
     }
 }
 
-/// Options from the environment. The device is `choice`, or else `SPLATVK_DEVICE`.
+/// Options from the environment. The device is `choice`, or else `SPLATVK_DEVICE`, among those that
+/// `CUDA_VISIBLE_DEVICES` leaves: Vulkan itself ignores that variable.
 /// `SPLATVK_VALIDATION=1` turns the validation layer on, `gpu` its GPU-assisted checks, too.
 /// `SPLATVK_STAGING=1` keeps buffers out of host-visible memory. `SPLATVK_MAX_BINDING` limits the
 /// size of a buffer, MiB. `SPLATVK_DISABLE` names kernel variants to disable, separated by commas
@@ -44,6 +45,8 @@ pub fn options(choice: Option<&str>) -> Options {
     let validation = validation.as_deref();
     Options {
         choice: choice.map(str::to_owned).or_else(|| variable("SPLATVK_DEVICE")),
+        // Set and empty hides all devices of NVIDIA.
+        cuda_visible: std::env::var("CUDA_VISIBLE_DEVICES").ok(),
         validation: validation.is_some_and(|v| v == "1" || v == "gpu"),
         gpu_assisted: validation.is_some_and(|v| v == "gpu"),
         staging: variable("SPLATVK_STAGING").is_some_and(|v| v == "1"),

@@ -34,8 +34,9 @@ fn line(topic: &str, status: Status, found: impl Into<String>, advice: Option<&s
 /// Reports loader, devices and the features of the device that would be used (`choice` as in
 /// [`super::open`]). Never fails: a missing part is a line.
 pub fn vulkan(choice: Option<&str>) -> Vec<Line> {
+    let options = options(choice);
     let missing = |topic: &str, found: String| line(topic, Status::Missing, found, Some(INSTALL));
-    let Survey { loader: (major, minor, patch), devices, chosen } = match survey(&options(choice)) {
+    let Survey { loader: (major, minor, patch), devices, chosen } = match survey(&options) {
         Ok(survey) => survey,
         Err(e) => return vec![missing("Vulkan", e.to_string())],
     };
@@ -46,7 +47,11 @@ pub fn vulkan(choice: Option<&str>) -> Vec<Line> {
             Ok(info) => {
                 let (major, minor, patch) = info.api_version;
                 let kind = if info.is_cpu { ", runs on the CPU" } else { "" };
-                let found = format!("{name} (Vulkan {major}.{minor}.{patch}, {}{kind})", info.driver);
+                let pci = info.pci.iter().map(|pci| format!(" · pci:{pci}")).collect::<String>();
+                let found = format!(
+                    "{name} (Vulkan {major}.{minor}.{patch}, {}{kind}) · uuid:{}{pci}",
+                    info.driver, info.uuid
+                );
                 line(&topic, Status::Ok, found, None)
             }
             Err(reason) => {
@@ -54,6 +59,10 @@ pub fn vulkan(choice: Option<&str>) -> Vec<Line> {
                 line(&topic, Status::Note, format!("{name}: {reason}"), Some(advice))
             }
         });
+    }
+    if let Some(list) = &options.cuda_visible {
+        let found = format!("`{list}`: other cards of NVIDIA are not used");
+        lines.push(line("CUDA_VISIBLE_DEVICES", Status::Note, found, None));
     }
     match chosen {
         Ok(info) => describe(&info, &mut lines),

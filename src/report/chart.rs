@@ -140,7 +140,7 @@ pub fn bar_chart(bars: &[Bar], title: &str) -> String {
 }
 
 /// Escapes a text for HTML and SVG.
-pub(super) fn escape(text: &str) -> String {
+pub fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 

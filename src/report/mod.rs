@@ -9,6 +9,7 @@ mod line;
 mod summary;
 pub mod viewer;
 
+pub use chart::escape;
 pub use contents::{
     AnswerShown, Certainty, Curve, Figure, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown,
 };

@@ -37,6 +37,7 @@ pub use answer::Answers;
 pub use compat::Compat;
 pub use config::{GeometryConfig, LanguageConfig, ReconstructionConfig, TrainingConfig};
 pub use execute::{reconstruct, run, save, stage_folder};
+pub use networks::models_used;
 pub use method::{FEATURE_DIM, Method, Recipe};
 pub use outcome::RunOutcome;
 pub use plan::{CHECKPOINT_SECONDS, Destination, Extras, Inputs, Machine, RunPlan};

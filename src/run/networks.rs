@@ -1,11 +1,24 @@
 //! Networks of the user in a run: found before any work, listed in run.json.
 use super::config::ReconstructionConfig;
+use super::plan::RunPlan;
 use super::sources::{DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, installed};
 use crate::Result;
 use crate::infer::Registry;
 use crate::infer::installed::{HashedFile, Installed};
 use crate::progress::Progress;
 use crate::report::ModelUsed;
+
+/// Models that a plan uses: the built-in pack, and the files of networks.
+///
+/// # Errors
+/// A missing network, or a file that cannot be read.
+pub fn models_used(plan: &RunPlan) -> Result<Vec<ModelUsed>> {
+    let registry = plan.machine.registry()?;
+    let networks = Networks::find(&plan.config, &registry)?.used()?;
+    let built_in = registry.status().into_iter().filter(|m| m.installed);
+    let built_in = built_in.map(|m| ModelUsed { name: m.name, sha256: m.sha256, licence: m.licence });
+    Ok(built_in.chain(networks).collect())
+}
 
 /// The networks of a configuration.
 pub(super) struct Networks(Vec<Installed>);

@@ -4,11 +4,13 @@ use super::config::ReconstructionConfig;
 use super::sources::SourceChoice;
 use crate::fit::{LanguageOptions, Preset, RgbOptions, ViewDependentOptions};
 use crate::gpu::{self, Device};
+use crate::infer::installed::inventory;
 use crate::infer::{Compute, Registry};
 use crate::query::phrasing;
 use crate::scene::GivenCamera;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
 use std::path::{Path, PathBuf};
 
 /// Default of `checkpoint_seconds`. Training states are some ten megabytes for scenes of a few
@@ -67,7 +69,7 @@ pub struct Extras {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Machine {
-    /// Vulkan device: part of its name, or its number.
+    /// Vulkan device: `uuid:…`, `pci:…`, its number, or a part of its name.
     pub device: Option<String>,
     /// Folder of the models.
     pub models: Option<PathBuf>,
@@ -98,6 +100,27 @@ impl Default for Destination {
             resume: false,
             checkpoint_seconds: CHECKPOINT_SECONDS,
         }
+    }
+}
+
+impl RunPlan {
+    /// A plan from options by name, with the sources named: those of a [`ReconstructionConfig`] and
+    /// the given `others`.
+    ///
+    /// # Errors
+    /// Unknown options, values of the wrong type, and missing networks.
+    pub fn with_options(options: &Map<String, Value>, others: &[&str]) -> Result<RunPlan> {
+        let wrong = |e: serde_json::Error| Error::input(format!("options: {e}"));
+        let known = serde_json::to_value(ReconstructionConfig::default()).map_err(wrong)?;
+        let has = |key: &str| known.get(key).is_some() || others.contains(&key);
+        if let Some(key) = options.keys().find(|key| !has(key)) {
+            return Err(Error::input(format!(
+                "there is no option {key}; the options are those of splatvk run, with underscores"
+            )));
+        }
+        let plan: RunPlan = serde_json::from_value(Value::Object(options.clone())).map_err(wrong)?;
+        let config = plan.config.resolved(&inventory(&plan.machine.registry()?))?;
+        Ok(RunPlan { config, ..plan })
     }
 }
 

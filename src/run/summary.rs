@@ -137,8 +137,13 @@ fn figures(o: &RunOutcome) -> Vec<Figure> {
 
 /// Lines of the closing table: figures, device, and the answers last.
 fn closing_lines(o: &RunOutcome) -> Vec<(String, String)> {
-    let cpu = if o.device.is_cpu { " (CPU)" } else { "" };
-    let device = std::iter::once(("device".to_owned(), format!("{}{cpu}", o.device.name)));
+    // Equal cards of one machine differ by their address.
+    let which = match &o.device.pci {
+        _ if o.device.is_cpu => " (CPU)".to_owned(),
+        Some(pci) => format!(" (pci:{pci})"),
+        None => String::new(),
+    };
+    let device = std::iter::once(("device".to_owned(), format!("{}{which}", o.device.name)));
     let figures = figures(o).into_iter().map(|f| (f.label.to_owned(), f.value));
     let answers = o.language.iter().flat_map(|l| &l.answers);
     let answers = answers.map(|a| (format!("“{}”", report::one_line(&a.text)), a.verdict()));
@@ -276,6 +281,7 @@ fn scene<'a>(title: &'a str, photos: &'a [RgbImage], o: &'a RunOutcome) -> Scene
         language: o.language.as_ref().map(|l| &l.field),
         names: o.language.as_ref().map_or(&NO_NAMES, |l| &l.names),
         answers: o.language.iter().flat_map(|l| &l.answers).map(Answers::shown).collect(),
+        suggested: Vec::new(),
     }
 }
 

@@ -7,7 +7,7 @@ use numpy::{Element, PyReadonlyArray1};
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use serde_json::Value;
+use serde_json::{Map, Value};
 use splatvk::infer::Registry;
 use splatvk::infer::installed::inventory;
 use splatvk::run::live::LiveScene;
@@ -352,13 +352,8 @@ pub fn reconstruct(py: Python<'_>, plan: &str, observer: Py<PyAny>) -> PyResult<
 /// Reads a plan and names its sources; keys that no plan has are refused.
 fn read_plan(text: &str) -> Result<RunPlan> {
     let wrong = |e: serde_json::Error| Error::input(format!("options: {e}"));
-    let given: Value = serde_json::from_str(text).map_err(wrong)?;
+    let given: Map<String, Value> = serde_json::from_str(text).map_err(wrong)?;
     let known = serde_json::to_value(RunPlan::default()).map_err(wrong)?;
-    let has = |key: &String| known.get(key).is_some();
-    if let Some(key) = given.as_object().and_then(|keys| keys.keys().find(|key| !has(key))) {
-        return Err(Error::input(format!("there is no option {key}; help(splatvk.reconstruct) lists them")));
-    }
-    let plan: RunPlan = serde_json::from_value(given).map_err(wrong)?;
-    let config = plan.config.resolved(&inventory(&plan.machine.registry()?))?;
-    Ok(RunPlan { config, ..plan })
+    let others: Vec<&str> = known.as_object().into_iter().flatten().map(|(key, _)| key.as_str()).collect();
+    RunPlan::with_options(&given, &others)
 }

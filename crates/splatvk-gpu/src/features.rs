@@ -1,4 +1,5 @@
 //! Device features: the offered ones, the enabled ones, and the shader capabilities that follow.
+use crate::choice;
 use crate::enabled::EnabledFeatures;
 use crate::error::vk_error;
 use crate::info::{DeviceInfo, Options};
@@ -187,6 +188,8 @@ fn describe(
         (text(v12.driver_name_as_c_str().map_err(drop)), text(v12.driver_info_as_c_str().map_err(drop)));
     DeviceInfo {
         name: candidate.name.clone(),
+        uuid: choice::uuid_text(candidate.uuid),
+        pci: candidate.pci.map(|pci| pci.to_string()),
         driver: format!("{} {}", driver.0, driver.1).trim().to_owned(),
         api_version: (
             vk::api_version_major(version),

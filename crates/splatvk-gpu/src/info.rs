@@ -11,8 +11,12 @@ pub const NATIVE_FLOAT_ATOMICS: &str = "native float atomics";
 /// How a device is opened.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
-    /// Index in the order of preference, or part of the name; `None` takes the first usable one.
+    /// `uuid:…` (its beginning), `pci:…` as of `lspci -D`, index in the order of preference, or part
+    /// of the name that no other device has; `None` takes the first usable one.
     pub choice: Option<String>,
+    /// As CUDA's variable `CUDA_VISIBLE_DEVICES`: the devices of NVIDIA that may be used, as UUIDs
+    /// or as numbers along the PCI bus. `None`: all.
+    pub cuda_visible: Option<String>,
     /// Khronos validation layer with synchronization validation.
     pub validation: bool,
     /// With validation: shaders also check every access to a buffer. A test takes minutes instead
@@ -46,6 +50,10 @@ pub const LOOP_ROUNDS: usize = 65_535;
 pub struct DeviceInfo {
     /// As the driver reports it.
     pub name: String,
+    /// 8-4-4-4-12 hexadecimal digits.
+    pub uuid: String,
+    /// Address on the PCI bus, "0000:3b:00.0"; `None` where the driver reports none.
+    pub pci: Option<String>,
     /// Driver name and version.
     pub driver: String,
     /// Vulkan version of the device: major, minor, patch.

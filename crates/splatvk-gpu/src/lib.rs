@@ -67,6 +67,7 @@ mod barrier;
 mod buffer;
 mod cache;
 mod call;
+mod choice;
 mod command;
 mod compile_time;
 mod device;

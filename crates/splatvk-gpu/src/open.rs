@@ -3,7 +3,7 @@ use crate::device::{Device, Setup};
 use crate::info::Options;
 use crate::validation::Sink;
 use crate::{Error, Result};
-use crate::{features, select};
+use crate::{choice, features, select};
 use ash::vk;
 
 impl Device {
@@ -36,7 +36,7 @@ impl Device {
         sink: Option<Sink>,
         options: &Options,
     ) -> Result<Device> {
-        let candidate = select::choose(select::candidates(instance)?, options.choice.as_deref())?;
+        let candidate = choice::choose(select::candidates(instance, options)?, options.choice.as_deref())?;
         let physical = candidate.physical;
         let queue_family = select::queue_family(instance, physical)
             .ok_or_else(|| Error::no_device(format!("{} has no compute queue", candidate.name)))?;

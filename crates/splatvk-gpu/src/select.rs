@@ -1,6 +1,7 @@
-//! Vulkan loader, instance and the choice of a physical device.
+//! Vulkan loader, instance and physical devices.
+use crate::choice::{self, Pci};
 use crate::validation;
-use crate::{Error, Result};
+use crate::{Error, Options, Result};
 use ash::vk;
 use std::ffi::CStr;
 
@@ -13,6 +14,10 @@ pub(crate) struct Candidate {
     pub physical: vk::PhysicalDevice,
     pub properties: vk::PhysicalDeviceProperties,
     pub name: String,
+    /// The same for every driver of the card; `nvidia-smi -L` prints it, too.
+    pub uuid: [u8; 16],
+    /// Where the driver reports it.
+    pub pci: Option<Pci>,
     /// Why it cannot be used, if so.
     pub unusable: Option<String>,
 }
@@ -60,14 +65,14 @@ pub(crate) fn instance(entry: &ash::Entry, sink: Option<&validation::Sink>) -> R
         .map_err(|e| no_device(format!("no Vulkan instance ({e}); {INSTALL}"), e))
 }
 
-/// All physical devices, best first: discrete, integrated, virtual, CPU.
-pub(crate) fn candidates(instance: &ash::Instance) -> Result<Vec<Candidate>> {
+/// The visible physical devices, best first: discrete, integrated, virtual, CPU.
+pub(crate) fn candidates(instance: &ash::Instance, options: &Options) -> Result<Vec<Candidate>> {
     // SAFETY: the instance is alive.
     let devices = unsafe { instance.enumerate_physical_devices() }
         .map_err(|e| no_device(format!("the Vulkan drivers list no device ({e}); {INSTALL}"), e))?;
     let mut all: Vec<Candidate> = devices.into_iter().map(|physical| candidate(instance, physical)).collect();
     best_first(&mut all);
-    Ok(all)
+    choice::visible(all, options.cuda_visible.as_deref())
 }
 
 /// Devices of one kind keep the driver's order.
@@ -96,7 +101,30 @@ pub(crate) fn candidate(instance: &ash::Instance, physical: vk::PhysicalDevice) 
     } else {
         None
     };
-    Candidate { physical, properties, name, unusable }
+    let (uuid, pci) = identity(instance, physical, properties.api_version);
+    Candidate { physical, properties, name, uuid, pci, unusable }
+}
+
+/// UUID and PCI address.
+fn identity(
+    instance: &ash::Instance,
+    physical: vk::PhysicalDevice,
+    api_version: u32,
+) -> ([u8; 16], Option<Pci>) {
+    if api_version < vk::API_VERSION_1_1 {
+        return ([0; 16], None);
+    }
+    let on_bus = has_extension(&extensions(instance, physical), ash::ext::pci_bus_info::NAME);
+    let mut id = vk::PhysicalDeviceIDProperties::default();
+    let mut bus = vk::PhysicalDevicePCIBusInfoPropertiesEXT::default();
+    let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut id);
+    if on_bus {
+        properties = properties.push_next(&mut bus);
+    }
+    // SAFETY: the chain holds only structures whose version or extension the device has.
+    unsafe { instance.get_physical_device_properties2(physical, &mut properties) };
+    let address = Pci([bus.pci_domain, bus.pci_bus, bus.pci_device, bus.pci_function]);
+    (id.device_uuid, on_bus.then_some(address))
 }
 
 pub(crate) fn extensions(
@@ -126,53 +154,19 @@ pub(crate) fn queue_family(instance: &ash::Instance, physical: vk::PhysicalDevic
         .map(|i| i as u32)
 }
 
-/// The first usable device, or the one whose index in this order, or part of whose name, is
-/// `choice`.
-pub(crate) fn choose(all: Vec<Candidate>, choice: Option<&str>) -> Result<Candidate> {
-    let names: Vec<String> = all.iter().enumerate().map(|(i, c)| format!("{i} = {}", c.name)).collect();
-    let listed = names.join(", ");
-    if all.is_empty() {
-        return Err(Error::no_device(format!("no Vulkan device; {INSTALL}")));
-    }
-    let picked = match choice {
-        None => all.into_iter().find(|c| c.unusable.is_none()),
-        Some(text) => {
-            let index = text.parse::<usize>().ok();
-            let wanted = text.to_lowercase();
-            all.into_iter()
-                .enumerate()
-                .find(|(i, c)| index.map_or_else(|| c.name.to_lowercase().contains(&wanted), |w| w == *i))
-                .map(|(_, c)| c)
-        }
-    };
-    match (picked, choice) {
-        (Some(Candidate { name, unusable: Some(reason), .. }), _) => {
-            Err(Error::no_device(format!("Vulkan device {name} cannot be used: {reason}")))
-        }
-        (Some(candidate), _) => Ok(candidate),
-        (None, Some(text)) => {
-            // "There are 0: llvmpipe" would read as "no device".
-            Err(Error::Choice(format!(
-                "no Vulkan device matches `{text}`; give the number or a part of the name: {listed}"
-            )))
-        }
-        (None, None) => Err(Error::no_device(format!(
-            "no usable Vulkan device among {listed}: Vulkan 1.2 with VK_KHR_synchronization2 and a compute queue is needed; {INSTALL}"
-        ))),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use ash::vk::PhysicalDeviceType as Kind;
 
-    fn made_up(name: &str, kind: Kind, unusable: Option<&str>) -> Candidate {
+    fn made_up(name: &str, kind: Kind) -> Candidate {
         Candidate {
             physical: vk::PhysicalDevice::null(),
             properties: vk::PhysicalDeviceProperties { device_type: kind, ..Default::default() },
             name: name.to_owned(),
-            unusable: unusable.map(str::to_owned),
+            uuid: [0; 16],
+            pci: None,
+            unusable: None,
         }
     }
 
@@ -186,20 +180,9 @@ mod tests {
             ("discrete", Kind::DISCRETE_GPU),
             ("second", Kind::DISCRETE_GPU),
         ];
-        let mut all: Vec<Candidate> = kinds.iter().map(|(name, kind)| made_up(name, *kind, None)).collect();
+        let mut all: Vec<Candidate> = kinds.iter().map(|(name, kind)| made_up(name, *kind)).collect();
         best_first(&mut all);
         let names: Vec<&str> = all.iter().map(|c| c.name.as_str()).collect();
         assert_eq!(names, ["discrete", "second", "integrated", "virtual", "llvmpipe", "other"]);
-    }
-
-    #[test]
-    fn what_is_unusable_is_passed_over_unless_it_is_asked_for() {
-        let old = || made_up("Old GPU", Kind::DISCRETE_GPU, Some("update the driver"));
-        let all = || vec![old(), made_up("New GPU", Kind::INTEGRATED_GPU, None)];
-        assert_eq!(choose(all(), None).unwrap().name, "New GPU");
-        assert_eq!(choose(all(), Some("new")).unwrap().name, "New GPU");
-        let said = |all, choice| choose(all, choice).err().unwrap().to_string();
-        assert!(said(all(), Some("0")).ends_with("Old GPU cannot be used: update the driver"));
-        assert!(said(vec![old()], None).contains("no usable Vulkan device among 0 = Old GPU"));
     }
 }

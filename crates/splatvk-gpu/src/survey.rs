@@ -1,5 +1,5 @@
 //! The Vulkan devices of this machine, described without opening one.
-use crate::{DeviceInfo, Error, Options, Result, features, select};
+use crate::{DeviceInfo, Error, Options, Result, choice, features, select};
 use ash::vk;
 
 /// A machine's loader and devices.
@@ -42,12 +42,12 @@ pub fn survey(options: &Options) -> Result<Survey> {
 }
 
 fn devices(instance: &ash::Instance, options: &Options) -> Result<(Vec<Surveyed>, Result<DeviceInfo>)> {
-    let all = select::candidates(instance)?;
+    let all = select::candidates(instance, options)?;
     let devices = all
         .iter()
         .map(|c| Surveyed { name: c.name.clone(), info: features::survey(instance, c, options) })
         .collect();
-    let chosen = select::choose(all, options.choice.as_deref())
+    let chosen = choice::choose(all, options.choice.as_deref())
         .and_then(|c| features::survey(instance, &c, options).map_err(Error::no_device));
     Ok((devices, chosen))
 }

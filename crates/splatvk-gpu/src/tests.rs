@@ -157,8 +157,8 @@ fn submissions_hold_the_hosts_queue_lock() {
     let options = Options::default();
     let entry = crate::select::load().unwrap();
     let instance = crate::select::instance(&entry, None).unwrap();
-    let all = crate::select::candidates(&instance).unwrap();
-    let candidate = crate::select::choose(all, options.choice.as_deref()).unwrap();
+    let all = crate::select::candidates(&instance, &options).unwrap();
+    let candidate = crate::choice::choose(all, options.choice.as_deref()).unwrap();
     let family = crate::select::queue_family(&instance, candidate.physical).unwrap();
     let (raw, _) = crate::features::create(&instance, &candidate, family, &options).unwrap();
     // SAFETY: the queue was requested in `create`.

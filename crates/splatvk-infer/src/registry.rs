@@ -260,7 +260,7 @@ mod tests {
         for part in ["hed.onnx is missing", &wanted.sha256, "tools/setup"] {
             assert!(missing.to_string().contains(part), "{missing}");
         }
-        assert_eq!(missing.exit_code(), 2);
+        assert_eq!(missing.exit_code(), 3);
 
         let file = registry.path(PackFileKind::Keypoints).unwrap();
         let mut bytes = std::fs::read(&file).unwrap();

@@ -59,7 +59,7 @@ fn clip_towers_are_recognised_and_matched() {
     clip_in(dir.path(), [1, 2, 0]);
     let mismatched = Clip::load(registry.installed(Task::Features, "clip").unwrap()).err().unwrap();
     assert!(mismatched.to_string().contains("do not belong together"), "{mismatched}");
-    assert_eq!(mismatched.exit_code(), 2);
+    assert_eq!(mismatched.exit_code(), 3);
 }
 
 /// Folders from a hub also have both towers in one graph, and incompletely downloaded variants.
@@ -251,7 +251,7 @@ fn catalogue_is_sound_and_explains_absence() {
     for part in ["splatvk models fetch dust3r", "NC", "tools/export/export_dust3r.py", "naver/dust3r"] {
         assert!(text.contains(part), "{part}: {text}");
     }
-    assert_eq!(error.exit_code(), 2);
+    assert_eq!(error.exit_code(), 3);
     let text = Registry::of(&[dir.path()]).installed(Task::Masks, "sam").unwrap_err().to_string();
     assert!(text.contains("models fetch sam_vit_b"), "of a family the one that needs no export: {text}");
 }

@@ -154,15 +154,33 @@ impl Error {
         }
         self
     }
-    /// Process exit code: 2 for bad usage, bad input, a missing part or a place that cannot be
-    /// written (also a full disk); 1 for a failure while working; 130 when stopped by the user.
+    /// Kind of the error in the log, finer than the exit code.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Error::Input(_) => "input",
+            Error::Io { .. } => "io",
+            Error::Unwritable { .. } => "unwritable",
+            Error::Missing(_) | Error::MissingModel { .. } => "missing",
+            Error::NoDevice { .. } => "no-device",
+            Error::DeviceLost { .. } => "device-lost",
+            Error::OutOfDeviceMemory { .. } => "memory",
+            Error::Gpu { .. } => "gpu",
+            Error::Work(_) => "work",
+            Error::Cancelled => "cancelled",
+        }
+    }
+    /// Process exit code, by the next step of a script: 2 for bad usage or refused input (change the
+    /// command), 3 for a missing part (install it), 4 for a place that cannot be written, also a
+    /// full disk (make space), 5 for a lost device or one without memory (try again, or smaller), 1
+    /// for another failure while working; 130 when stopped by the user.
     pub fn exit_code(&self) -> u8 {
         match self {
-            Error::Input(_) | Error::Missing(_) | Error::MissingModel { .. } => 2,
-            Error::NoDevice { .. } | Error::Unwritable { .. } => 2,
+            Error::Input(_) => 2,
             Error::Io { source, .. } if !advice(source).is_empty() => 2,
+            Error::Missing(_) | Error::MissingModel { .. } | Error::NoDevice { .. } => 3,
+            Error::Unwritable { .. } => 4,
+            Error::DeviceLost { .. } | Error::OutOfDeviceMemory { .. } => 5,
             Error::Io { .. } | Error::Gpu { .. } | Error::Work(_) => 1,
-            Error::DeviceLost { .. } | Error::OutOfDeviceMemory { .. } => 1,
             Error::Cancelled => 130,
         }
     }
@@ -238,13 +256,13 @@ mod tests {
         let full = full.keeping(Some("cameras".into()));
         assert!(full.to_string().ends_with("--resume goes on from cameras"), "{full}");
         let other = Error::gpu("fence");
-        assert_eq!([&lost, &full, &other].map(Error::exit_code), [1; 3]);
+        assert_eq!([&lost, &full, &other].map(Error::exit_code), [5, 5, 1]);
 
         let disk = Error::io("a/b")(IoError::from(ErrorKind::StorageFull));
         assert!(matches!(&disk, Error::Unwritable { path, .. } if path == Path::new("a/b")));
         let cause = disk.source().and_then(|s| s.downcast_ref::<IoError>());
         assert_eq!(cause.map(IoError::kind), Some(ErrorKind::StorageFull));
-        assert!(disk.exit_code() == 2 && disk.to_string().contains("free some space"), "{disk}");
+        assert!(disk.exit_code() == 4 && disk.to_string().contains("free some space"), "{disk}");
         let absent = Error::io("a/b")(IoError::from(ErrorKind::NotFound));
         assert!(matches!(absent, Error::Io { .. }) && absent.exit_code() == 2);
         // A file in the place of a folder, and the reverse, are errors of the user.
@@ -253,8 +271,8 @@ mod tests {
             assert!(e.exit_code() == 2 && e.to_string().ends_with("; check the name"), "{e}");
         }
         let none = Error::NoDevice { message: "no loader".into(), source: Some("libvulkan.so.1".into()) };
-        assert!(none.exit_code() == 2 && none.source().is_some_and(|s| s.to_string() == "libvulkan.so.1"));
-        assert_eq!(Error::missing_model("text", "model text: is missing").exit_code(), 2);
+        assert!(none.exit_code() == 3 && none.source().is_some_and(|s| s.to_string() == "libvulkan.so.1"));
+        assert_eq!(Error::missing_model("text", "model text: is missing").exit_code(), 3);
     }
 
     #[cfg(feature = "gpu")]

@@ -1,5 +1,6 @@
 //! Progress and cancellation of long work.
 use crate::checkpoint::Checkpoint;
+use crate::scene::{Camera, Splats};
 use crate::sync::lock;
 use crate::{Error, Result};
 use std::sync::Mutex;
@@ -51,6 +52,13 @@ pub trait Progress: Send + Sync {
     fn checkpoint(&self) -> Option<&Checkpoint> {
         None
     }
+    /// Whether the splats of the training so far are of use now; reading them from the device takes
+    /// time.
+    fn wants_splats(&self) -> bool {
+        false
+    }
+    /// Splats and cameras of the training so far.
+    fn splats(&self, _splats: Splats, _cameras: &[Camera]) {}
     /// Progress of work in a second lane, parallel to this one: stages of the two lanes do not end
     /// each other. Hosts that show one stage at a time keep this default, which ignores the second
     /// lane.

@@ -101,8 +101,8 @@ pub struct BenchArgs {
     /// programs
     #[arg(long, value_name = "DIR", conflicts_with = "json")]
     pub write_scene: Option<PathBuf>,
-    /// Vulkan device: part of its name, or its number in `splatvk doctor`
-    #[arg(long, value_name = "NAME|INDEX")]
+    /// Vulkan device: uuid:…, pci:…, its number in `splatvk doctor`, or a part of its name
+    #[arg(long, value_name = "DEVICE")]
     pub device: Option<String>,
     /// `--provider`, which stands before or after the command.
     #[arg(skip)]

@@ -61,8 +61,8 @@ impl SavingArgs {
 /// Options that every command working on a device takes.
 #[derive(Clone, Debug, Default, Args)]
 pub struct DeviceArgs {
-    /// Vulkan device: part of its name, or its number in `splatvk doctor`
-    #[arg(long, value_name = "NAME|INDEX", help_heading = MACHINE)]
+    /// Vulkan device: uuid:…, pci:…, its number in `splatvk doctor`, or a part of its name
+    #[arg(long, value_name = "DEVICE", help_heading = MACHINE)]
     pub device: Option<String>,
     /// Folder of the models
     #[arg(long, value_name = "DIR", help_heading = MACHINE)]

@@ -27,12 +27,13 @@ const REPORT_SPLATS: usize = 300_000;
 const THUMBNAIL: usize = 104;
 
 /// Import name and text of each module.
-const MODULES: [(&str, &str); 11] = [
+const MODULES: [(&str, &str); 12] = [
     ("splatvk/camera", include_str!("camera.js")),
     ("splatvk/controls", include_str!("controls.js")),
     ("splatvk/measure", include_str!("measure.js")),
     ("splatvk/motion", include_str!("motion.js")),
     ("splatvk/names", include_str!("names.js")),
+    ("splatvk/preview", include_str!("preview.js")),
     ("splatvk/pick", include_str!("pick.js")),
     ("splatvk/render", include_str!("render.js")),
     ("splatvk/sort", include_str!("sort.js")),
@@ -103,6 +104,17 @@ pub struct Scene3d<'a> {
     pub names: &'a CodeNames,
     /// Answered queries.
     pub answers: Vec<ShownAnswer<'a>>,
+    /// Queries to choose from.
+    pub suggested: Vec<String>,
+}
+
+/// Content of a served page that may change while it is open.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Lifetime {
+    /// It stays.
+    Final,
+    /// A preview: the page follows the state of the server, and takes new splats or another page.
+    Preview,
 }
 
 impl Scene3d<'_> {
@@ -123,12 +135,12 @@ impl Scene3d<'_> {
     }
 
     /// Whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `no_questions` is
-    /// the reason why it cannot answer, if any, and `notice` a line that the page shows at first.
-    pub fn served(&self, no_questions: Option<&str>, notice: Option<&str>) -> Result<String> {
+    /// the reason why it cannot answer, if any. A preview follows `GET state`.
+    pub fn served(&self, no_questions: Option<&str>, lifetime: Lifetime) -> Result<String> {
         let mut manifest = self.manifest(no_questions.unwrap_or_default())?;
         manifest["live"] = no_questions.is_none().into();
         manifest["scene"] = SCENE_PATH.into();
-        manifest["notice"] = notice.into();
+        manifest["renews"] = (lifetime == Lifetime::Preview).into();
         let title = super::chart::escape(self.title);
         Ok(format!(
             "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" \
@@ -150,6 +162,7 @@ impl Scene3d<'_> {
             "metres": self.world.scale.as_ref().map(|s| s.metres_per_unit),
             "up": self.world.up.as_ref().map(|u| u.direction.to_array()),
             "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at)).collect::<Vec<_>>(),
+            "suggested": self.suggested,
             "answers": self.answers.iter().map(ShownAnswer::json).collect::<Vec<_>>(),
         }))
     }
@@ -227,6 +240,7 @@ mod tests {
             language: None,
             names: &Vec::new(),
             answers: vec![answer],
+            suggested: vec!["mug".into()],
         };
         let (html, note) = scene.embedded().unwrap();
         assert!(note.contains(&format!("of {} splats", splats.len())), "{note}");
@@ -240,11 +254,12 @@ mod tests {
         let forward = camera.pose.rotation.row(2);
         assert_eq!(manifest["views"][0]["rotation"][8], forward.z);
         assert_eq!(manifest["views"][0]["rotation"][6], forward.x);
-        let page = scene.served(Some("no model"), Some("a preview")).unwrap();
+        let page = scene.served(Some("no model"), Lifetime::Preview).unwrap();
         assert!(page.contains("viewer full") && page.contains("a&lt;b") && !page.contains("v-splats\""));
         assert!(page.contains("\"ask_note\":\"no model\"") && page.contains("\"live\":false"));
-        assert!(page.contains("\"notice\":\"a preview\""));
-        assert!(scene.served(None, None).unwrap().contains("\"live\":true"));
+        assert!(page.contains("\"renews\":true") && page.contains("\"suggested\":[\"mug\"]"));
+        let last = scene.served(None, Lifetime::Final).unwrap();
+        assert!(last.contains("\"live\":true") && last.contains("\"renews\":false"));
         // Every imported module exists.
         for (_, text) in MODULES {
             for line in text.lines().filter(|l| l.starts_with("import ")) {

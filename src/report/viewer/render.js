@@ -266,6 +266,15 @@ export class Renderer {
     this.images = new Map();
   }
 
+  /// Frees what grows with the scene.
+  free() {
+    const { gl } = this, images = [...this.images.values()];
+    [...Object.values(this.textures), ...Object.values(this.projected), ...images.map((i) => i.texture)].forEach((t) => gl.deleteTexture(t));
+    [this.projection, ...images.map((i) => i.frame)].forEach((f) => gl.deleteFramebuffer(f));
+    [this.project, this.quads, this.resolve].forEach((p) => gl.deleteProgram(p.made));
+    gl.deleteVertexArray(this.array);
+  }
+
   framebuffer(textures) {
     const { gl } = this, made = gl.createFramebuffer(), slots = textures.map((_, k) => gl.COLOR_ATTACHMENT0 + k);
     gl.bindFramebuffer(gl.FRAMEBUFFER, made);

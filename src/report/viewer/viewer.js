@@ -6,6 +6,7 @@ import { Tape, lengthText } from "splatvk/measure";
 import { MOST, Motion, Pace, firstCamera } from "splatvk/motion";
 import { isClear, namesOf, perhaps } from "splatvk/names";
 import { pick } from "splatvk/pick";
+import { follow, kept } from "splatvk/preview";
 import { Renderer } from "splatvk/render";
 import { download, extentOf, gunzip, medianDepth, unpack } from "splatvk/splats";
 import { connectPage } from "splatvk/things";
@@ -19,7 +20,7 @@ const up = manifest.up || upOf(views);
 
 const state = { mode: "colour", level: levels.findLastIndex((l) => l.colours.length), selected: null, picked: null, query: null, guessed: true };
 const STALE = 0, ROUGH = 1, SHARP = 2;
-let splats, extent, renderer, motion, worker, near = 0.01;
+let splats, extent, renderer, motion, worker, next = null, near = 0.01;
 let request = 0, sortedFor = -1, waiting = false, drawn = STALE, capturing = false;
 const idle = [], pace = new Pace();
 const tape = new Tape(find(".v-tape"), find(".v-line"), manifest.metres, say);
@@ -42,13 +43,7 @@ async function load() {
   canvas.addEventListener("webglcontextrestored", restore);
   const source = JSON.parse(document.querySelector("script[type=importmap]").textContent).imports["splatvk/sort"];
   worker = new Worker(source);
-  worker.onmessage = ({ data }) => {
-    renderer.setOrder(data);
-    sortedFor = data.id;
-    waiting = false;
-    drawn = STALE;
-    if (request !== sortedFor) sort();
-  };
+  worker.onmessage = ({ data }) => sorted(data);
   worker.postMessage({ positions: splats.positions.slice() });
   const home = firstCamera(views, extent, manifest.up);
   near = 0.01 * medianDepth(splats, home);
@@ -56,12 +51,39 @@ async function load() {
   aimAt(home);
   // A tenth of the usual depth: nearer, a single surface fills the picture.
   motion = new Motion({ home, views, up, closest: 10 * near }, { aim: aimAt, moved, shown: markPhoto, playing });
+  kept.take(motion);
   wait.remove();
   new ResizeObserver(resized).observe(canvas);
   new IntersectionObserver(([entry]) => { motion.onScreen = entry.isIntersecting; }).observe(canvas);
   moved();
   requestAnimationFrame(frame);
   if (root.classList.contains("full")) root.focus();
+  if (manifest.renews) follow(manifest, { renew, say: (text) => say(text, true), leave: () => kept.put(motion) });
+}
+
+/// Shows other splats of the same scene from the present camera, once they are sorted.
+async function renew() {
+  const fresh = unpack(await gunzip(await download(manifest.scene, () => {})));
+  next = { splats: fresh, renderer: new Renderer(canvas, fresh, levels), after: request };
+  worker.postMessage({ positions: fresh.positions.slice() });
+  moved();
+}
+
+/// Takes a sorted order; one that was requested before the splats changed belongs to the old ones.
+function sorted(data) {
+  waiting = false;
+  if (next && data.id > next.after) {
+    renderer.free();
+    ({ splats, renderer } = next);
+    extent = extentOf(splats);
+    next = null;
+  }
+  if (!next) {
+    renderer.setOrder(data);
+    sortedFor = data.id;
+    drawn = STALE;
+  }
+  if (request !== sortedFor) sort();
 }
 
 /// Restores the graphics context, which phones take from pages in the background.
@@ -353,7 +375,10 @@ function setQuery(answer) {
 }
 
 function listQueries() {
+  const asked = (text) => answers.some((a) => a.text.toLowerCase() === text.toLowerCase());
+  const open = manifest.suggested.filter((text) => !asked(text)).map((text) => button(text, () => ask(text), { "aria-pressed": "false" }));
   const chips = answers.slice(-6).map((a) => button(a.text, () => (state.query === a ? clear() : ask(a.text)), { "aria-pressed": "false" }));
+  chips.push(...open);
   find(".v-chips").replaceChildren(...chips);
   find("datalist").replaceChildren(...answers.map((a) => Object.assign(document.createElement("option"), { value: a.text })));
 }
@@ -453,7 +478,7 @@ const actions = {
 
 let input;
 function connect() {
-  say(manifest.notice ?? "", true);
+  if (manifest.renews) say("A preview: the scene sharpens while it is being made.", true);
   find(".v-modes").replaceChildren(...modes.map((m) => button(m.name, () => show(m.mode, m.level), { role: "radio", title: m.title ?? "" })));
   show("colour");
   find(".v-photos").replaceChildren(...views.map((v, i) => {

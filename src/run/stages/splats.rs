@@ -5,7 +5,8 @@ use crate::Result;
 use crate::fit::{self, RgbOptions, Trained, ViewDependentOptions};
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
 use crate::pose::Geometry;
-use crate::run::preview::Preview;
+use crate::progress::Progress;
+use crate::run::preview::{Preview, Renewals, Renewing};
 
 /// The colour stage.
 pub struct TrainColour {
@@ -33,11 +34,13 @@ impl Stage for TrainColour {
         let depths = (!geometry.depths.is_empty()).then_some(geometry.depths.as_slice());
         let (targets, coverage) = shared::targets(&placed.photos);
         let photos = shared::posed(&targets, &geometry.cameras, depths, &coverage);
+        let options = &self.options;
+        let train = |progress: &dyn Progress| fit::train_photos(context.device, photos, &geometry.points, options, progress);
+        let Some(preview) = &self.preview else { return train(context.progress) };
+        let renewals = Renewals::new();
         std::thread::scope(|scope| {
-            if let Some(preview) = &self.preview {
-                scope.spawn(|| preview.show(placed, geometry, &self.options, context.progress));
-            }
-            fit::train_photos(context.device, photos, &geometry.points, &self.options, context.progress)
+            scope.spawn(|| preview.show(placed, geometry, options, &renewals, context.progress));
+            train(&Renewing { progress: context.progress, to: &renewals })
         })
     }
 }

@@ -394,7 +394,7 @@ mod tests {
     fn full_disk_is_error() {
         let array = NpyArray::f32(&[2], vec![1.0, 2.0]);
         let error = write_packed_npz("/dev/full", &[("a", &array)]).unwrap_err();
-        assert!(error.exit_code() == 2 && error.to_string().contains("the disk is full"), "{error}");
+        assert!(error.exit_code() == 4 && error.to_string().contains("the disk is full"), "{error}");
     }
 
     #[test]

@@ -255,7 +255,7 @@ mod tests {
             assert_eq!((path, source.kind()), (&place, std::io::ErrorKind::StorageFull));
             let text = e.to_string();
             assert!(
-                e.exit_code() == 2 && text.lines().count() == 1 && text.contains("free some space"),
+                e.exit_code() == 4 && text.lines().count() == 1 && text.contains("free some space"),
                 "{e}"
             );
             drop(w);
