@@ -89,6 +89,7 @@ class Node:
         self.start()
 
     def start(self):
+        self.was_up = False
         with open(self.base / f"node-{'head' if self.head else 'joined'}.log", "ab") as log:
             self.process = subprocess.Popen(self.command, stdout=log, stderr=log, start_new_session=True)
 
@@ -96,7 +97,13 @@ class Node:
         return [p for p in below(self.process.pid, table) if text in table[p][1]]
 
     def up(self):
-        return bool(self.members("raylet_socket_name", processes()))
+        up = bool(self.members("raylet_socket_name", processes()))
+        self.was_up |= up
+        return up
+
+    def lost(self):
+        """Whether it was up once, and is not; one that starts is neither."""
+        return not self.up() and (self.was_up or self.process.poll() is not None)
 
     def stop(self):
         """Ends all of it, by number."""
@@ -227,7 +234,7 @@ class Test:
         print(f"  kill {sum(self.kills.values()):2}: {kind:8} {len(doomed)} below it, gone after {took:.2f} s", flush=True)
 
     def revive(self, nodes, drivers):
-        if not nodes[1].up():
+        if nodes[1].lost():
             nodes[1].stop()
             nodes[1].start()
         for driver in drivers:
@@ -345,10 +352,9 @@ def run(options, base):
         scratch = list((base / "scratch").iterdir())
         wrong += [f"scratch folder {p} is left" for p in scratch]
     finally:
-        for node in nodes:
-            node.stop()
-        kill(server.pid)
-        server.wait()
+        table = processes()
+        for pid in below(os.getpid(), table):
+            kill(pid)
     print(f"\n| killed | times | slowest end of what it ran, s |\n|---|---|---|")
     for kind, times in sorted(test.kills.items()):
         print(f"| {kind} | {times} | {test.gone.get(kind, 0.0):.2f} |")
@@ -383,6 +389,8 @@ def main():
         os.execvp("unshare", [*command, sys.executable, *sys.argv])
     # Ray's sockets need a short path.
     base = Path(tempfile.mkdtemp(prefix="sc-", dir="/tmp"))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: sys.exit(130))
     try:
         code = run(options, base)
     finally:

@@ -47,7 +47,8 @@ def test_remote_manifest_is_read():
     "row, message",
     [
         ({"id": "a", "input": "x", "view": 4}, "unknown key `view`"),
-        ({"id": ".a", "input": "x"}, "begin with no dot"),
+        ({"id": ".a", "input": "x"}, "begin with a letter"),
+        ({"id": "_a", "input": "x"}, "begin with a letter"),
         ({"id": "a/b", "input": "x"}, "must be 1 to 100"),
         ({"id": "a" * 101, "input": "x"}, "must be 1 to 100"),
         ({"id": "a\n", "input": "x"}, "must be 1 to 100"),
@@ -63,8 +64,8 @@ def test_wrong_rows_are_refused(row, message):
 
 
 def test_wrong_manifests_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"m.jsonl:2: id a is there twice"):
-        read(write(tmp_path / "m.jsonl", {"id": "a", "input": "x"}, {"id": "a", "input": "y"}))
+    with pytest.raises(InputError, match=r"m.jsonl:2: id A is there twice"):
+        read(write(tmp_path / "m.jsonl", {"id": "a", "input": "x"}, {"id": "A", "input": "y"}))
     (tmp_path / "m.jsonl").write_text('{"id": "a",\n')
     with pytest.raises(InputError, match=r"m.jsonl:1: no JSON"):
         read(str(tmp_path / "m.jsonl"))
@@ -89,8 +90,7 @@ def test_shards_part_the_rows(tmp_path):
              "SLURM_ARRAY_TASK_STEP": "4"},
             (2, 3),
         ),
-        ({"JOB_COMPLETION_INDEX": "3", "SPLATVK_SHARDS": "8"}, (3, 8)),
-        ({"AWS_BATCH_JOB_ARRAY_INDEX": "0", "AWS_BATCH_JOB_ARRAY_SIZE": "8"}, (0, 8)),
+                ({"AWS_BATCH_JOB_ARRAY_INDEX": "0", "AWS_BATCH_JOB_ARRAY_SIZE": "8"}, (0, 8)),
         ({"BATCH_TASK_INDEX": "1", "BATCH_TASK_COUNT": "2"}, (1, 2)),
     ],
 )
@@ -105,5 +105,6 @@ def test_wrong_shards_are_refused(monkeypatch):
         with pytest.raises(InputError, match="--shard"):
             shard_of(text)
     monkeypatch.setenv("JOB_COMPLETION_INDEX", "1")
-    with pytest.raises(InputError, match="SPLATVK_SHARDS"):
+    with pytest.raises(InputError, match="auto/N"):
         shard_of("auto")
+    assert shard_of("auto/8") == (1, 8)

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import json
 import os
 import signal
 import statistics
@@ -29,17 +30,26 @@ def _parser() -> argparse.ArgumentParser:
     add("--address", help="Ray cluster; `local` starts one here [default: RAY_ADDRESS, else the one that runs here, else local]")
     add("--gpus-per-row", type=float, metavar="N", help="may be a fraction [default: 1 where the cluster has GPUs, else 0]")
     add("--cpus-per-row", type=float, metavar="N", help="[default: the share of a GPU; without GPUs 4, or what the smallest node has]")
-    add("--timeout", type=float, metavar="SECONDS", help="wall-clock limit of the program for a row")
+    add("--timeout", type=_seconds, metavar="TIME", help="longest time of a row, with s, m or h")
     add("--retries", type=int, default=2, metavar="N", help="more tries of a row whose machine failed [default: 2]")
     add("--max-failures", metavar="N|P%", help="start no more rows once more have failed")
-    add("--only", choices=["failed"], help="rows that failed in an earlier run")
-    add("--shard", default="0/1", metavar="I/N", help="every N-th row from I on; auto: by the variables of a job array")
+    add("--only", choices=["failed"], help="rows whose last attempt failed, refused ones included")
+    add("--shard", default="0/1", metavar="I/N", help="every N-th row from I on; auto in an array job, auto/N on Kubernetes")
     add("--dry-run", action="store_true", help="show what would be done")
     add("--device", help="Vulkan device of every node, instead of the one that Ray gives")
     add("--scratch", metavar="DIR", help="folder of temporary files on every node")
     add("--lease", type=float, default=3600.0, metavar="SECONDS", help="time for an upload, after which it is abandoned [default: 3600]")
+    add("--json", action="store_true", help="one JSON object on standard output")
     add("--log", choices=["text", "json"], default="text", help="messages on standard error")
     return parser
+
+
+def _seconds(text: str) -> float:
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
+    seconds = float(text[:-1]) * units[text[-1]] if text[-1:] in units else float(text)
+    if not 0 < seconds < 1e7:
+        raise ValueError(text)
+    return seconds
 
 
 def _limit(text: str | None, total: int) -> float | None:
@@ -151,6 +161,8 @@ def _drive(
         events.write("end", text, done=counts.done, skipped=counts.skipped, failed=failed, exit_code=code)
         events.flush()
         summary.write(store)
+    if arguments.json:
+        print(json.dumps({"rows": total, "kept": counts.skipped, "done": counts.done, "failed": failed}))
     return code
 
 

@@ -87,7 +87,7 @@ class Looker:
             outcome = {"id": name, "attempts": 0, **finished(store, name, found, "skipped")}
             if name in self._failed and self._clean:
                 delete_failure(store, name)
-        elif name in self._failed:
+        elif name in self._failed and not self._only_failed:
             outcome = self._refused(name, source)
         return Look(row, outcome, source, len(files), sum(f[1] for f in files), swept)
 

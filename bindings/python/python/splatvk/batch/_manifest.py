@@ -6,6 +6,7 @@ import json
 import os
 import random
 import re
+import sys
 import tempfile
 from array import array
 from collections.abc import Iterable, Iterator
@@ -15,7 +16,7 @@ from typing import Any, TypedDict
 from ..errors import InputError
 from ._address import is_remote, join, listing, open_text
 
-ID = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9._-]{0,99}")
+ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 KEYS = ("id", "input", "options", "queries", "exports")
 
 
@@ -47,7 +48,7 @@ def row_of(raw: object, where: str = "row", base: str = "") -> Row:
     name = raw.get("id")
     if not isinstance(name, str) or not ID.fullmatch(name):
         raise InputError(
-            f"{where}: id {json.dumps(name)} must be 1 to 100 of A-Z a-z 0-9 . _ - and begin with no dot"
+            f"{where}: id {json.dumps(name)} must be 1 to 100 of A-Z a-z 0-9 . _ - and begin with a letter or digit"
         )
     inputs = _texts(raw.get("input", ()), "input", where)
     if not inputs:
@@ -78,12 +79,13 @@ def _json_rows(lines: Iterable[str], name: str) -> Iterator[tuple[str, object]]:
 def _csv_rows(lines: Iterable[str], name: str) -> Iterator[tuple[str, object]]:
     reader = csv.DictReader(lines)
     columns = reader.fieldnames or []
-    if sorted(columns) != ["id", "input"]:
+    if sorted(column.strip() for column in columns) != ["id", "input"]:
         raise InputError(f"{name}: the first line must be `id,input`, not `{','.join(columns)}`")
     for row in reader:
-        if None in row:
-            raise InputError(f"{name}:{reader.line_num}: more than two columns")
-        yield f"{name}:{reader.line_num}", row
+        where = f"{name}:{reader.line_num}"
+        if None in row or None in row.values():
+            raise InputError(f"{where}: a row has two columns")
+        yield where, {column.strip(): value.strip() for column, value in row.items()}
 
 
 class Manifest:
@@ -99,9 +101,10 @@ class Manifest:
         ids: set[str] = set()
         for index, (where, raw) in enumerate(rows):
             row = row_of(raw, where, base)
-            if row["id"] in ids:
-                raise InputError(f"{where}: id {row['id']} is there twice")
-            ids.add(row["id"])
+            # File systems may not tell the case of letters apart.
+            if row["id"].lower() in ids:
+                raise InputError(f"{where}: id {row['id']} is there twice, if case is left out")
+            ids.add(row["id"].lower())
             if index % shard[1] == shard[0]:
                 self._starts.append(self._file.tell())
                 self._file.write(json.dumps(row).encode() + b"\n")
@@ -120,7 +123,10 @@ class Manifest:
 
 
 def read(manifest: str, shard: tuple[int, int] = (0, 1)) -> Manifest:
-    """The manifest at a path or an address; `shard` (I, N) keeps every N-th row from I on."""
+    """The manifest at a path or an address, or of standard input (`-`); `shard` (I, N) keeps every
+    N-th row from I on."""
+    if manifest == "-":
+        return Manifest(_json_rows(sys.stdin, "standard input"), os.getcwd(), shard)
     if not is_remote(manifest) and os.path.isdir(manifest):
         folders = sorted(p for p in Path(manifest).iterdir() if p.is_dir() and p.name[0] != ".")
         if not folders:
@@ -134,29 +140,39 @@ def read(manifest: str, shard: tuple[int, int] = (0, 1)) -> Manifest:
         return Manifest(_json_rows(lines, manifest), base, shard)
 
 
+#: Index and number of an array job; Kubernetes states no number.
+_ARRAYS = (
+    ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT"),
+    ("JOB_COMPLETION_INDEX", ""),
+    ("AWS_BATCH_JOB_ARRAY_INDEX", "AWS_BATCH_JOB_ARRAY_SIZE"),
+    ("BATCH_TASK_INDEX", "BATCH_TASK_COUNT"),
+)
+
+
 def shard_of(text: str) -> tuple[int, int]:
-    """`I/N`, or `auto`: the place in an array of Slurm, Kubernetes, AWS Batch or Google Batch."""
-    if text != "auto":
-        found = re.fullmatch(r"(\d+)/(\d+)", text)
-        if not found or int(found[1]) >= int(found[2]):
-            raise InputError(f"--shard {text}: give I/N with I from 0 to N-1, or auto")
-        return int(found[1]), int(found[2])
-    env = os.environ
-    if "SLURM_ARRAY_TASK_ID" in env:
-        first, step = int(env["SLURM_ARRAY_TASK_MIN"]), int(env.get("SLURM_ARRAY_TASK_STEP") or 1)
-        place = (int(env["SLURM_ARRAY_TASK_ID"]) - first) // step
-        return place, int(env["SLURM_ARRAY_TASK_COUNT"])
-    # Each manager's index, and its number of tasks, which Kubernetes does not set.
-    for index, count in (
-        ("BATCH_TASK_INDEX", "BATCH_TASK_COUNT"),
-        ("AWS_BATCH_JOB_ARRAY_INDEX", "AWS_BATCH_JOB_ARRAY_SIZE"),
-        ("JOB_COMPLETION_INDEX", "SPLATVK_SHARDS"),
-    ):
-        if index in env:
-            if count not in env:
-                raise InputError(f"--shard auto: {index} is set; set {count} to the number of tasks")
-            return shard_of(f"{env[index]}/{env[count]}")
-    raise InputError("--shard auto: no variable of Slurm, Kubernetes, AWS Batch or Google Batch is set")
+    """`I/N`; `auto` in an array job of Slurm, AWS Batch or Google Batch; `auto/N` in Kubernetes."""
+    found = re.fullmatch(r"(\d+|auto)(?:/(\d+))?", text)
+    if not found or not (found[2] or found[1] == "auto"):
+        raise InputError(f"--shard {text}: give I/N with I from 0, or auto in an array job")
+    count = found[2]
+    if found[1] != "auto":
+        index = int(found[1])
+    else:
+        env = os.environ
+        name, size = next(((name, size) for name, size in _ARRAYS if name in env), ("", ""))
+        if not name:
+            names = ", ".join(name for name, _ in _ARRAYS)
+            raise InputError(f"--shard auto needs an array job; none of {names} is set")
+        count = count or env.get(size)
+        if not count:
+            raise InputError(f"--shard auto: {name} states no number of parts; give auto/N")
+        index = int(env[name])
+        if name == "SLURM_ARRAY_TASK_ID":
+            first, step = env.get("SLURM_ARRAY_TASK_MIN") or 0, env.get("SLURM_ARRAY_TASK_STEP") or 1
+            index = (index - int(first)) // int(step)
+    if not 0 <= index < int(count):
+        raise InputError(f"--shard: part {index} of {count}; parts count from 0")
+    return index, int(count)
 
 
 def source_of(row: Row, version: str) -> dict[str, Any]:

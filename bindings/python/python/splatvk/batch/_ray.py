@@ -17,7 +17,7 @@ from ._look import Looker
 from ._manifest import Row
 from ._record import Events, Summary
 from ._results import read_success, write_failure
-from ._row import Outcome, run_row
+from ._row import Outcome, finished, run_row
 from ._store import Store
 
 #: A node that lacks something, or cannot write, so often in succession gets no more rows: it would
@@ -269,7 +269,7 @@ class Engine:
             # A lost worker may have finished, and so may another driver.
             found = read_success(self._store, name)
             if found and found.get("source") == outcome.get("source"):
-                outcome = {"id": name, "attempts": outcome["attempts"], "state": "skipped", **found}
+                outcome = {"id": name, "attempts": outcome["attempts"], **finished(self._store, name, found, "skipped")}
             else:
                 write_failure(self._store, outcome)
         self._summary.add(outcome)

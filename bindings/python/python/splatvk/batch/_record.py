@@ -13,7 +13,22 @@ from typing import Any
 from ._row import Outcome
 from ._store import Store
 
-COLUMNS = ("id", "state", "seconds", "device", "psnr", "splats", "attempts", "error", "scene")
+#: Those of the engine of one machine, and the attempts of this run.
+COLUMNS = (
+    "id",
+    "state",
+    "seconds",
+    "device",
+    "photos",
+    "psnr",
+    "rotation_sigma_degrees",
+    "splats",
+    "answers_found",
+    "warnings",
+    "error",
+    "scene",
+    "attempts",
+)
 #: An object is written again with every flush, so it ends at this size and another begins.
 _OBJECT_BYTES = 4 << 20
 _FLUSH_SECONDS = 30.0

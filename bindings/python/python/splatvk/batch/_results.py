@@ -73,7 +73,7 @@ def commit(store: Store, name: str, attempt: Attempt, success: dict[str, Any]) -
 def _delete_replaced(store: Store, name: str, old: dict[str, Any] | None) -> None:
     at = (old or {}).get("at", ".")
     # A result of the one-machine engine lies in the folder itself.
-    for folder in ("scene", "exports") if at == "." else (at,):
+    for folder in ("scene", "exports", "log.jsonl") if at == "." else (at,):
         try:
             store.delete(f"{name}/{folder}")
         except OSError:
@@ -124,3 +124,6 @@ def read_failure(store: Store, name: str) -> dict[str, Any] | None:
 
 def delete_failure(store: Store, name: str) -> None:
     store.delete(failure_path(name))
+    if store.appends:
+        # The engine of one machine keeps the log of a failure in a folder, beside it.
+        store.delete(f"_failed/{name}.log")

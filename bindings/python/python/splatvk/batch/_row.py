@@ -158,21 +158,17 @@ def _work(
         if found:
             return finished(store, row["id"], found, "skipped")
 
-    if max_size is not None:
-        local["options"] = {**row["options"], "max_size": max_size}
     result = keeper.scratch / "result"
     argv = [program, "batch-row", "--out", str(result), "--log", "json"]
     if device is not None:
         argv += ["--device", device]
+    if max_size is not None:
+        argv += ["--max-size", str(max_size)]
     ended = keeper.run(argv, json.dumps(local), timeout)
     _check(ended, timeout, key)
     success = _success_of(result)
-    # The row's own key and options: a run with less memory still answers the same row.
-    success.update(key=key, source=source, options=row["options"], host=socket.gethostname())
-    if max_size is not None:
-        success["reduced"] = {"max_size": max_size}
-        note = f"device memory ran out; made again with max_size {max_size}"
-        success["warnings"] = [*success.get("warnings", []), note]
+    success.update(source=source, input=row["input"], host=socket.gethostname())
+    (result / "log.jsonl").write_text(ended.stderr, encoding="utf-8")
     return _stored(store, row["id"], result, success, lease)
 
 
@@ -236,21 +232,20 @@ def _check(ended: Ended, timeout: float | None, key: str | None) -> None:
 
 
 def _reason(ended: Ended) -> tuple[str, str, int]:
-    message = ""
+    message, kind = "", ""
     for line in reversed(ended.stderr.splitlines()):
         try:
             event = json.loads(line)
         except ValueError:
             continue
         if isinstance(event, dict) and event.get("event") == "error":
-            message = str(event.get("message"))
+            message, kind = str(event.get("message")), str(event.get("kind"))
             break
     code = ended.exit_code
     if code < 0:
         return "transient", message or f"killed by signal {-code}", code
     if code == 5:
-        memory = "memory" in message and "lost" not in message
-        return ("memory" if memory else "transient"), message, code
+        return ("memory" if kind == "memory" else "transient"), message, code
     last = ended.stderr.strip().rpartition("\n")[2]
     return EXIT_CODES.get(code, "failed"), message or last or f"exit code {code}", code
 
@@ -269,5 +264,9 @@ def _success_of(result: Path) -> dict[str, Any]:
 
 def finished(store: Store, name: str, success: dict[str, Any], state: str) -> Outcome:
     place = "" if success.get("at", ".") == "." else f"/{success['at']}"
-    shown = {key: success.get(key) for key in ("seconds", "device", "psnr", "splats", "key")}
+    shown = {key: success.get(key) for key in ("seconds", "photos", "psnr", "rotation_sigma_degrees", "splats", "key")}
+    device = success.get("device")
+    shown["device"] = device.get("name") if isinstance(device, dict) else device
+    shown["answers_found"] = sum(a.get("found") is True for a in success.get("answers") or ())
+    shown["warnings"] = len(success.get("warnings") or ())
     return {"state": state, **shown, "scene": f"{store.address}/{name}{place}/scene"}
