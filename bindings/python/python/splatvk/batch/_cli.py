@@ -27,18 +27,23 @@ def _parser() -> argparse.ArgumentParser:
     add("manifest", help="JSON lines {id, input, options, queries, exports}, CSV id,input, or a folder of folders")
     add("--out", required=True, metavar="ADDRESS", help="folder, or address of fsspec: s3://bucket/scenes")
     add("--engine", choices=["ray"], default="ray", help=argparse.SUPPRESS)
-    add("--address", help="Ray cluster; `local` starts one here [default: RAY_ADDRESS, else the one that runs here, else local]")
-    add("--gpus-per-row", type=float, metavar="N", help="may be a fraction [default: 1 where the cluster has GPUs, else 0]")
-    add("--cpus-per-row", type=float, metavar="N", help="[default: the share of a GPU; without GPUs 4, or what the smallest node has]")
+    where = "Ray cluster; `local` starts one here [default: RAY_ADDRESS, else the one that runs here, else local]"
+    add("--address", help=where)
+    gpus = "may be a fraction [default: 1 where the cluster has GPUs, else 0]"
+    add("--gpus-per-row", type=float, metavar="N", help=gpus)
+    cpus = "[default: the share of a GPU; without GPUs 4, or what the smallest node has]"
+    add("--cpus-per-row", type=float, metavar="N", help=cpus)
     add("--timeout", type=_seconds, metavar="TIME", help="longest time of a row, with s, m or h")
     add("--retries", type=int, default=2, metavar="N", help="more tries of a row whose machine failed [default: 2]")
     add("--max-failures", metavar="N|P%", help="start no more rows once more have failed")
     add("--only", choices=["failed"], help="rows whose last attempt failed, refused ones included")
-    add("--shard", default="0/1", metavar="I/N", help="every N-th row from I on; auto in an array job, auto/N on Kubernetes")
+    shard = "every N-th row from I on; auto in an array job, auto/N on Kubernetes"
+    add("--shard", default="0/1", metavar="I/N", help=shard)
     add("--dry-run", action="store_true", help="show what would be done")
     add("--device", help="Vulkan device of every node, instead of the one that Ray gives")
     add("--scratch", metavar="DIR", help="folder of temporary files on every node")
-    add("--lease", type=float, default=3600.0, metavar="SECONDS", help="time for an upload, after which it is abandoned [default: 3600]")
+    lease = "time for an upload, after which it is abandoned [default: 3600]"
+    add("--lease", type=float, default=3600.0, metavar="SECONDS", help=lease)
     add("--json", action="store_true", help="one JSON object on standard output")
     add("--log", choices=["text", "json"], default="text", help="messages on standard error")
     return parser

@@ -156,7 +156,8 @@ class Engine:
         for node in _nodes():
             if node["NodeID"] not in self._excluded:
                 has = node["Resources"]
-                fits = [has.get(name, 0) // need for name, need in (("GPU", options.gpus), ("CPU", options.cpus)) if need]
+                needs = (("GPU", options.gpus), ("CPU", options.cpus))
+                fits = [has.get(name, 0) // need for name, need in needs if need]
                 slots += min(fits or [1])
         return int(slots)
 
