@@ -200,6 +200,13 @@ def test_killed_keeper_ends_program(scratch, tmp_path, processes):
     assert os.listdir(scratch) == []
 
 
+def test_keeper_killed_at_start_leaves_nothing(scratch, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with pytest.raises(KeeperGone), Keeper(str(scratch)):
+        pass
+    assert os.listdir(scratch) == []
+
+
 def test_abandoned_scratch_is_cleared(scratch):
     scratch.mkdir()
     dead, live = scratch / "splatvk-batch-dead", scratch / "other"

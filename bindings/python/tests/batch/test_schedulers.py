@@ -1,6 +1,7 @@
 """`run_row` under other schedulers, as docs/use/cluster.md shows it."""
 
 import json
+import sys
 from functools import partial
 
 import pytest
@@ -36,6 +37,7 @@ def test_spark_maps_rows(rows, tmp_path, monkeypatch):
     sql = pytest.importorskip("pyspark.sql")
     pytest.importorskip("pyarrow")
     monkeypatch.setenv("SPARK_LOCAL_IP", "127.0.0.1")
+    monkeypatch.setenv("PYSPARK_PYTHON", sys.executable)
     out, manifest = str(tmp_path / "out"), tmp_path / "m.jsonl"
     manifest.write_text("".join(json.dumps(row) + "\n" for row in rows))
 

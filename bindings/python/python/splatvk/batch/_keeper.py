@@ -11,7 +11,6 @@ with its threads starts it, but this process with one.
 """
 
 import ctypes
-import fcntl
 import json
 import os
 import select
@@ -23,7 +22,7 @@ from collections.abc import Iterator
 from typing import Any
 
 PR_SET_PDEATHSIG = 1
-#: Held while the keeper lives: a folder whose lock is free is a leftover.
+#: Locked by a file that the keeper inherits and keeps open; its programs do not. A folder whose lock is free is a leftover.
 LOCK = ".lock"
 
 
@@ -75,6 +74,8 @@ def _start(request: dict[str, Any], libc: Any) -> int:
             file = os.open(path, mode, 0o644)
             os.dup2(file, number)
             os.close(file)
+        # The lock is the keeper's.
+        os.closerange(3, 256)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGPIPE):
             signal.signal(number, signal.SIG_DFL)
         os.execvpe(request["argv"][0], request["argv"], {**os.environ, **request["env"]})
@@ -126,8 +127,6 @@ def main(folder: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
-    lock = os.open(os.path.join(folder, LOCK), os.O_RDWR | os.O_CREAT, 0o644)
-    fcntl.flock(lock, fcntl.LOCK_EX)
     os.write(1, b"{}\n")
     libc = _libc()
     for request in _lines():

@@ -17,7 +17,8 @@ from ..errors import MissingError
 from ._keeper import LOCK, remove
 
 _PREFIX = "splatvk-batch-"
-#: A folder without a lock is a leftover after this time; a keeper takes its lock within a second.
+_NEW = ".new-" + _PREFIX
+#: A folder without a lock is a leftover after this time.
 _UNLOCKED_SECONDS = 600.0
 
 
@@ -49,8 +50,10 @@ def find_program() -> str:
 
 def clear_scratch(root: Path) -> None:
     """Deletes scratch folders whose keepers are gone."""
-    for folder in root.glob(_PREFIX + "*"):
+    for folder in (*root.glob(_PREFIX + "*"), *root.glob(_NEW + "*")):
         try:
+            if folder.name.startswith(_NEW):
+                raise FileNotFoundError
             handle = os.open(folder / LOCK, os.O_RDWR)
         except OSError:
             try:
@@ -77,15 +80,28 @@ class Keeper:
     def __enter__(self) -> "Keeper":
         self._root.mkdir(parents=True, exist_ok=True)
         clear_scratch(self._root)
-        self.scratch = Path(tempfile.mkdtemp(prefix=_PREFIX, dir=self._root))
+        made = Path(tempfile.mkdtemp(prefix=_NEW, dir=self._root))
         script = Path(__file__).with_name("_keeper.py")
-        self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", str(script), str(self.scratch)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        self._answer()
+        lock = os.open(made / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            # Under its name the folder is locked from the beginning: another worker would delete it.
+            self.scratch = made.with_name(made.name.removeprefix(_NEW.removesuffix(_PREFIX)))
+            made.rename(self.scratch)
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-S", str(script), str(self.scratch)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                pass_fds=[lock],
+            )
+        finally:
+            os.close(lock)
+        try:
+            self._answer()
+        except KeeperGone:
+            self.__exit__(None, None, None)
+            raise
         return self
 
     def __exit__(
