@@ -1,31 +1,37 @@
 """The driver on a cluster of one node; `cluster.py` has the one that is killed."""
 
 import csv
+import importlib.util
 import json
 import secrets
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
+from cluster import RAY_PORT, Node, eventually
 
-pytest.importorskip("ray")
+pytestmark = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray")
 
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     """Address of a cluster of one node, since starting one takes longer than the rows."""
-    from ray.cluster_utils import Cluster
-
+    # Ray's sockets need a short path.
+    base = Path(tempfile.mkdtemp(prefix="sc-", dir="/tmp"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_AUTH_MODE", "token")
         patch.setenv("RAY_AUTH_TOKEN", secrets.token_hex(24))
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("SPLATVK_PROGRAM", str(Path(__file__).with_name("fake_splatvk")))
         patch.setenv("FAKE_SPLATVK_STATE", str(tmp_path_factory.mktemp("state")))
-        made = Cluster(initialize_head=True, head_node_args={"num_cpus": 2, "object_store_memory": 80 << 20})
-        yield made.address
-        made.shutdown()
+        node = Node(base, head=True)
+        eventually(node.up, 120, "the node is up")
+        yield f"127.0.0.1:{RAY_PORT}"
+        node.stop()
+    shutil.rmtree(base, ignore_errors=True)
 
 
 @pytest.fixture
