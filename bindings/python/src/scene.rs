@@ -357,6 +357,7 @@ impl Scene {
         let camera = this.get().camera(py, None)?;
         this.get().on_device(py, |live| Ok(live.ask(text, &camera)?.shown().json().to_string()))
     }
+    /// The interactive view as a frame, for notebooks.
     fn _repr_html_<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         this.py().import("splatvk._widget")?.call_method1("html", (this,))
     }
