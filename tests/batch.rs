@@ -141,6 +141,8 @@ fn changed_row_is_made_anew() {
 fn plan_makes_nothing() {
     let batch = Batch::new(&["a"]);
     batch.run(0, &["--dry-run"]);
+    let plan = Batch::new(&["a", "wrong"]).run(2, &["--dry-run"]);
+    assert_eq!(plan["rows"][1]["plan"], "refused: there is no option x");
     assert!(!batch.at("out").exists());
 }
 

@@ -120,7 +120,8 @@ pub fn within(size: usize, (room, most): (usize, Duration), read: impl FnOnce() 
         Err(_) => Some("panic".to_owned()),
         _ if time > most => Some(format!("{} ms", time.as_millis())),
         _ if peak > allowed => Some(format!("{peak} bytes for {size}, {allowed} are allowed")),
-        Ok(Err(e)) if e.exit_code() != 2 => Some(format!("exit code {}: {e}", e.exit_code())),
+        // A damaged model is a missing part (3), other damaged files are refused input.
+        Ok(Err(e)) if ![2, 3].contains(&e.exit_code()) => Some(format!("exit code {}: {e}", e.exit_code())),
         _ => None,
     };
     let error = outcome.as_ref().ok().and_then(|o| o.as_ref().err()).map(Error::to_string);

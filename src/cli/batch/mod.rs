@@ -26,7 +26,7 @@ use std::ffi::OsString;
 use std::fmt::Write;
 use std::os::unix::process::CommandExt;
 use std::path::PathBuf;
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 use store::{Failure, FailureKind, Store};
 
@@ -365,9 +365,8 @@ fn report_plan(
     let estimate = seconds.map(|s| s * make as f64 / places as f64);
     let names: Vec<&str> = devices.iter().map(|d| d.name.as_str()).collect();
     if args.json {
-        return print_json(&json!({
-            "rows": lines, "make": make, "devices": names, "seconds": estimate,
-        }));
+        print_json(&json!({ "rows": lines, "make": make, "devices": names, "seconds": estimate }))?;
+        return check_plans(plans);
     }
     let mut text = columns(&table);
     let time = match estimate {
@@ -375,7 +374,17 @@ fn report_plan(
         None => "no time is known before the first row is done".to_owned(),
     };
     let _ = writeln!(text, "\n{make} of {} rows to make on {}; {time}", rows.len(), names.join(", "));
-    print(&text)
+    print(&text)?;
+    check_plans(plans)
+}
+
+/// An error where a row is refused: a script is to notice.
+fn check_plans(plans: &[Plan<'_>]) -> Result<()> {
+    let refused = plans.iter().filter(|plan| matches!(plan, Plan::Refused(_) | Plan::Failed(_))).count();
+    if refused == 0 {
+        return Ok(());
+    }
+    Err(Error::input(format!("{refused} of {} rows are refused; see the plan", plans.len())))
 }
 
 /// Median seconds of the finished rows.
@@ -414,12 +423,18 @@ pub fn hand_over(arguments: &[OsString]) -> Result<()> {
         return Ok(());
     }
     let python = std::env::var_os("SPLATVK_PYTHON").unwrap_or_else(|| "python3".into());
-    let error = Command::new(&python).args(["-m", "splatvk.batch"]).args(rest).exec();
-    Err(Error::missing(format!(
-        "--engine ray needs Python with the package splatvk[batch]; {} cannot be run: {}",
-        python.to_string_lossy(),
-        crate::error::words(&error)
-    )))
+    let missing = |why: &str| {
+        let python = python.to_string_lossy();
+        Error::missing(format!("--engine ray needs Python with the package splatvk[batch]; {python} {why}"))
+    };
+    let cannot_run = |e: std::io::Error| missing(&format!("cannot be run: {}", crate::error::words(&e)));
+    let mut probe = Command::new(&python);
+    let found =
+        probe.args(["-c", "import splatvk.batch, ray"]).stderr(Stdio::null()).status().map_err(cannot_run)?;
+    if !found.success() {
+        return Err(missing("has no such package; pip install 'splatvk[batch]' brings it"));
+    }
+    Err(cannot_run(Command::new(&python).args(["-m", "splatvk.batch"]).args(rest).exec()))
 }
 
 #[cfg(test)]

@@ -119,7 +119,9 @@ impl PlannedRow<'_> {
                 line.extend(["--format".into(), name.into()]);
             }
             let args = ExportLine::try_parse_from(line)
-                .map_err(|e| wrong(e.to_string().lines().next().unwrap_or_default()))?
+                .map_err(|e| {
+                    wrong(e.to_string().lines().next().unwrap_or_default().trim_start_matches("error: "))
+                })?
                 .args;
             export::format(&args)?;
             Ok(args)
@@ -134,6 +136,12 @@ impl PlannedRow<'_> {
         }
         inputs.sort();
         let found = photo::find(&self.plan.inputs.photos)?;
+        if let ([photo], []) = (found.photos.as_slice(), found.videos.as_slice()) {
+            let photo = photo.display();
+            return Err(Error::input(format!(
+                "{photo}: only one photo; a scene needs two or more of one place"
+            )));
+        }
         if found.videos.is_empty() {
             photo::photo_count(found.photos.len(), self.plan.inputs.views)?;
         }

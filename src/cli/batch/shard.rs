@@ -49,17 +49,20 @@ impl Shard {
             let names = ARRAYS.map(|(index, _)| index).join(", ");
             format!("auto needs an array job; none of {names} is set")
         })?;
-        let first = match (name, variable("SLURM_ARRAY_TASK_MIN")) {
-            ("SLURM_ARRAY_TASK_ID", Some(first)) => number(&first)?,
-            _ => 0,
+        // Slurm counts from MIN in steps.
+        let of_slurm = |part: &str| match name {
+            "SLURM_ARRAY_TASK_ID" => variable(part).map(|text| number(&text)).transpose(),
+            _ => Ok(None),
         };
+        let first = of_slurm("SLURM_ARRAY_TASK_MIN")?.unwrap_or(0);
+        let step = of_slurm("SLURM_ARRAY_TASK_STEP")?.unwrap_or(1).max(1);
         let count = match (count, variable(size)) {
             (Some(count), _) => count,
             (None, Some(count)) => number(&count)?,
             (None, None) => return Err(format!("{name} states no number of parts; give auto/N")),
         };
         let index = number(&index)?.checked_sub(first).ok_or(format!("{name} is below the first"))?;
-        Ok(Shard { index, count })
+        Ok(Shard { index: index / step, count })
     }
 }
 
@@ -104,6 +107,11 @@ mod tests {
         let slurm =
             [("SLURM_ARRAY_TASK_ID", "5"), ("SLURM_ARRAY_TASK_COUNT", "4"), ("SLURM_ARRAY_TASK_MIN", "3")];
         assert_eq!(read("auto", &slurm), Ok(Shard { index: 2, count: 4 }));
+        let stepped = [
+            &slurm[1..2],
+            &[("SLURM_ARRAY_TASK_ID", "9"), ("SLURM_ARRAY_TASK_MIN", "1"), ("SLURM_ARRAY_TASK_STEP", "4")],
+        ];
+        assert_eq!(read("auto", &stepped.concat()), Ok(Shard { index: 2, count: 4 }));
         let kubernetes = [("JOB_COMPLETION_INDEX", "1")];
         assert!(read("auto", &kubernetes).unwrap_err().contains("auto/N"));
         assert_eq!(read("auto/8", &kubernetes), Ok(Shard { index: 1, count: 8 }));

@@ -65,7 +65,7 @@ fn csv(states: &[RowState<'_>]) -> Result<Vec<u8>> {
             of(field).as_f64().map(|v| format!("{v:.digits$}")).unwrap_or_default()
         };
         let device = of("device")["name"].as_str().unwrap_or_default().to_owned();
-        let scene = row.success.as_ref().map(|_| format!("{}/scene", row.id)).unwrap_or_default();
+        let scene = row.success.as_ref().map(|s| format!("{}/scene", folder(row.id, s))).unwrap_or_default();
         let (found, warnings) = (found(of("answers")), of("warnings").as_array().map_or(0, Vec::len));
         let counts = row.success.as_ref().map(|_| (found.to_string(), warnings.to_string()));
         let (found, warnings) = counts.unwrap_or_default();
@@ -87,6 +87,14 @@ fn csv(states: &[RowState<'_>]) -> Result<Vec<u8>> {
             .map_err(wrong)?;
     }
     table.into_inner().map_err(|e| Error::work(format!("summary.csv: {e}")))
+}
+
+/// Folder of the scene and the exports below that of the batch. A cluster writes them to one of its own.
+fn folder(id: &str, success: &Value) -> String {
+    match success["at"].as_str().filter(|at| *at != ".") {
+        Some(at) => format!("{id}/{at}"),
+        None => id.to_owned(),
+    }
 }
 
 /// Number of queries that were found.
@@ -134,13 +142,14 @@ fn card(row: &RowState<'_>) -> String {
             row.state
         );
     };
+    let place = escape(&folder(row.id, success));
     let files = success["files"].as_array().into_iter().flatten();
     let mut pictures = files.filter_map(|f| f["path"].as_str()).filter(|p| p.ends_with("_render.jpg"));
     let picture = pictures.next().map_or_else(
         || "<div class=\"none\"></div>".to_owned(),
-        |path| format!("<img loading=\"lazy\" alt=\"\" src=\"{id}/{}\">", escape(path)),
+        |path| format!("<img loading=\"lazy\" alt=\"\" src=\"{place}/{}\">", escape(path)),
     );
-    let _ = write!(card, "<a href=\"{id}/scene/report.html\">{picture}<p><b>{id}</b><br><small>");
+    let _ = write!(card, "<a href=\"{place}/scene/report.html\">{picture}<p><b>{id}</b><br><small>");
     let figure = |field: &str| success[field].as_f64();
     let psnr = figure("psnr").map(|v| format!("{v:.1} dB · ")).unwrap_or_default();
     let _ = write!(

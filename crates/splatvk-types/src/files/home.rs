@@ -48,7 +48,7 @@ mod tests {
         assert!(chosen("own", "", None).unwrap().is_absolute());
         for user in [None, Some("home"), Some("")] {
             let e = chosen("", "data", user).unwrap_err();
-            assert!(e.exit_code() == 2 && e.to_string().contains("SPLATVK_HOME"), "{e}");
+            assert!(e.exit_code() == 3 && e.to_string().contains("SPLATVK_HOME"), "{e}");
         }
     }
 }
