@@ -3,6 +3,7 @@ use super::args::DeviceArgs;
 use super::print::{print, print_json};
 use super::progress;
 use super::view::Shown;
+use crate::files;
 use crate::gpu;
 use crate::progress::Progress;
 use crate::report::{duration, shell_quoted};
@@ -68,14 +69,23 @@ pub fn demo(args: &DemoArgs) -> Result<()> {
             std::thread::sleep(Duration::from_millis(200));
         }
         // The thread's error is the reason why there is nothing to show.
-        if let Some(run) = run.filter(|run| run.is_finished()) {
-            run.join().unwrap_or_else(|_| Err(Error::work("the run of the demo ended early")))?;
-        }
+        let (finished, running) = match run {
+            Some(run) if run.is_finished() => (Some(run), None),
+            running => (None, running),
+        };
+        joined(finished)?;
         let queries = QUERIES.map(str::to_owned);
         let shown = Shown::open(&scene, 0, &args.device, &queries)?;
         open_browser(&shown.url());
-        shown.serve(false, &|_| Ok(()))
+        shown.serve(false, &|_| Ok(()))?;
+        joined(running)
     })
+}
+
+/// The result of the thread that makes the scene.
+fn joined(run: Option<std::thread::ScopedJoinHandle<'_, Result<()>>>) -> Result<()> {
+    let ended = run.map(std::thread::ScopedJoinHandle::join).unwrap_or(Ok(Ok(())));
+    ended.unwrap_or_else(|_| Err(Error::work("the run of the demo ended early")))
 }
 
 /// Writes the photos, says how long it takes, and returns the plan of the run.
@@ -83,6 +93,16 @@ fn plan(args: &DemoArgs, scene: &Path) -> Result<RunPlan> {
     let survey = splatvk_gpu::survey(&gpu::options(args.device.device.as_deref()))?;
     let info = survey.chosen?;
     let photos = args.out.join("photos");
+    // A folder of the user's own photos is no place for these.
+    let is_photo = |name: &str| PHOTOS.iter().any(|(photo, _)| name.strip_prefix("photos/") == Some(photo));
+    let own = |name: &str, _: bool| {
+        ["photos", "scene"].contains(&name) || name.starts_with("scene/") || is_photo(name)
+    };
+    let others = if args.out.exists() { files::foreign(&args.out, &own) } else { Vec::new() };
+    if !others.is_empty() {
+        let out = args.out.display();
+        return Err(Error::input(format!("{out}: holds {}; choose another --out", files::listed(&others))));
+    }
     std::fs::create_dir_all(&photos).map_err(Error::unwritable(&photos))?;
     for (name, bytes) in PHOTOS {
         let place = photos.join(name);

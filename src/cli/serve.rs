@@ -66,6 +66,8 @@ pub struct Site {
     pub scene: Vec<u8>,
     /// Whether questions are answered.
     pub answers_questions: bool,
+    /// Whether another page will follow.
+    pub is_preview: bool,
 }
 
 /// The site of a running server.
@@ -193,6 +195,7 @@ struct Content {
     scene_path: &'static str,
     scene: Bytes,
     answers_questions: bool,
+    is_preview: bool,
     /// Numbers of the page, and of the scene of that page.
     numbers: (u64, u64),
     notice: String,
@@ -205,6 +208,7 @@ impl Content {
             scene_path: site.scene_path,
             scene: site.scene.into(),
             answers_questions: site.answers_questions,
+            is_preview: site.is_preview,
             numbers: (0, 0),
             notice: String::new(),
         }
@@ -216,7 +220,9 @@ impl Content {
             "" => Some(("text/html; charset=utf-8", self.page.clone())),
             "state" => {
                 let (page, scene) = self.numbers;
-                let state = json!({ "page": page, "scene": scene, "notice": self.notice });
+                let state = json!({
+                    "page": page, "preview": self.is_preview, "scene": scene, "notice": self.notice,
+                });
                 Some(("application/json", state.to_string().into()))
             }
             name if name == self.scene_path => Some(("application/octet-stream", self.scene.clone())),

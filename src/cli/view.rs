@@ -156,8 +156,13 @@ impl Prepared {
         };
         let lifetime = if preview.is_some() { Lifetime::Preview } else { Lifetime::Final };
         let page = page(&scene, path, &names, suggested, (no_questions.as_deref(), lifetime))?;
-        let site =
-            Site { page, scene_path: SCENE_PATH, scene: pack(&scene)?, answers_questions: ready.is_some() };
+        let site = Site {
+            page,
+            scene_path: SCENE_PATH,
+            scene: pack(&scene)?,
+            answers_questions: ready.is_some(),
+            is_preview: preview.is_some(),
+        };
         Ok(Prepared { site, ready, preview })
     }
 }

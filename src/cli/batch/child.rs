@@ -13,6 +13,8 @@ use std::time::{Duration, Instant};
 const POLL: Duration = Duration::from_millis(50);
 /// Time between the request to end and the end by force.
 const GRACE: Duration = Duration::from_secs(5);
+/// The same after Ctrl-C: this process itself ends a second later, and the tables come before.
+const STOP_GRACE: Duration = Duration::from_millis(400);
 
 /// End of an attempt.
 #[derive(Clone, Debug, PartialEq)]
@@ -97,12 +99,12 @@ pub fn run(mut command: Command, row: &str, log: &Path, timeout: Option<Duration
             None => std::thread::sleep(POLL),
         }
     };
-    end(&mut child);
+    end(&mut child, if stop == Ending::Stopped { STOP_GRACE } else { GRACE });
     Ok(stop)
 }
 
 /// Ends a process and those that it started.
-fn end(child: &mut Child) {
+fn end(child: &mut Child, grace: Duration) {
     use rustix::process::{Pid, Signal, kill_process_group};
     let group = i32::try_from(child.id()).ok().and_then(Pid::from_raw);
     let signal = |signal| {
@@ -113,7 +115,7 @@ fn end(child: &mut Child) {
     };
     signal(Signal::TERM);
     let asked = Instant::now();
-    while asked.elapsed() < GRACE && matches!(child.try_wait(), Ok(None)) {
+    while asked.elapsed() < grace && matches!(child.try_wait(), Ok(None)) {
         std::thread::sleep(POLL);
     }
     signal(Signal::KILL);

@@ -152,6 +152,9 @@ fn checked(row: Row) -> Result<Row, String> {
             "id {id:?}: give 1 to {LONGEST_ID} of the letters a to z, digits, dots, dashes and underscores, beginning with a letter or digit"
         ));
     }
+    if ["index.html", "summary.csv", "events.jsonl"].contains(&id.to_lowercase().as_str()) {
+        return Err(format!("id {id:?}: a file of the batch has this name; give another"));
+    }
     if row.input.iter().all(|i| i.is_empty()) || row.input.iter().any(|i| i.is_empty()) {
         return Err(format!("row {id}: input is empty"));
     }

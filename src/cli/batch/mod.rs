@@ -263,7 +263,7 @@ fn work(
         return Err(Error::Unwritable { path: args.out.clone(), source });
     }
     let total = plans.len();
-    let (mut kept, mut refused) = (0, 0);
+    let (mut kept, mut refused, mut before) = (0, 0, 0);
     let mut jobs = Vec::new();
     for plan in plans {
         match plan {
@@ -272,7 +272,7 @@ fn work(
                 store.forget_failure(&row.id)?;
                 kept += 1;
             }
-            Plan::Refused(_) => refused += 1,
+            Plan::Refused(_) => before += 1,
             Plan::Failed(failure) => {
                 progress.warn(&format!("{}: {}: {}", failure.id, failure.kind.name(), failure.message));
                 store.event("failed", json!({ "id": failure.id, "failure": failure }))?;
@@ -284,7 +284,8 @@ fn work(
     }
     let names = devices.iter().map(|d| d.name.as_str()).collect::<Vec<_>>().join(", ");
     progress.inform(&format!(
-        "{total} captures: {kept} done before, {refused} refused, {} to make on {names}",
+        "{total} captures: {kept} done before, {} refused, {} to make on {names}",
+        refused + before,
         jobs.len()
     ));
     let most = match args.max_failures {
@@ -302,7 +303,7 @@ fn work(
     let counts = Queue::new(manifest, store, &limits, jobs, refused)?.work(devices, progress);
     table::write(manifest, store)?;
     let Counts { done, failed, elsewhere, left } = counts?;
-    let failed = failed + refused;
+    let failed = failed + refused + before;
     store.event("end", json!({ "done": done, "failed": failed, "left": left }))?;
     let index = args.out.join("index.html");
     if args.json {
@@ -323,7 +324,7 @@ fn work(
     progress.check()?;
     match failed + left {
         0 => Ok(()),
-        _ if failed > most => Err(Error::work(format!(
+        _ if failed - before > most => Err(Error::work(format!(
             "stopped after {failed} failed rows (--max-failures); the reasons are in {}",
             args.out.join("summary.csv").display()
         ))),

@@ -223,7 +223,9 @@ impl Store {
             // ID-KEY16-N, and ID-KEY16-N.log; ids have dashes, too.
             let mut parts = name.rsplitn(3, '-');
             let (_, key) = (parts.next(), parts.next());
-            if parts.next() == Some(id) && key.is_some_and(|k| k.len() == 16) {
+            if parts.next() == Some(id)
+                && key.is_some_and(|k| k.len() == 16 && k.bytes().all(|b| b.is_ascii_hexdigit()))
+            {
                 remove(&entry.path())?;
             }
         }
@@ -240,7 +242,9 @@ impl Store {
         if place.symlink_metadata().is_err() {
             std::fs::rename(attempt, &place).map_err(unwritable)?;
         } else {
-            let aside = attempt.with_extension("old");
+            let mut aside = attempt.as_os_str().to_owned();
+            aside.push(".old");
+            let aside = PathBuf::from(aside);
             swap(attempt, &place, &aside).map_err(unwritable)?;
             remove(attempt)?;
             remove(&aside)?;

@@ -13,7 +13,8 @@ export function follow(manifest, { renew, say, leave }) {
     try {
       const reply = await fetch("state"), now = await reply.json();
       page ??= now.page;
-      if (now.page !== page) {
+      // The finished page may have come before the first look.
+      if (now.page !== page || !now.preview) {
         leave();
         return location.reload();
       }
