@@ -61,7 +61,7 @@ pub fn run_with(arguments: Vec<OsString>) -> u8 {
     #[cfg(unix)]
     if let Err(error) = batch::hand_over(&arguments) {
         progress::set_format(Cli::NAME, LogFormat::Text);
-        progress::print_error(&error.to_string(), &error);
+        progress::print_error(&error);
         return error.exit_code();
     }
     start_with::<Cli>(arguments)
@@ -88,7 +88,7 @@ fn start_with<P: Program>(arguments: Vec<OsString>) -> u8 {
             0
         }
         Err(error) => {
-            progress::print_error(&error.to_string(), &error);
+            progress::print_error(&error);
             error.exit_code()
         }
     }

@@ -46,7 +46,13 @@ pub fn stopped() -> bool {
 /// Prints the error that ends the process; of two threads that end it the first wins. Unusable
 /// input, a missing part or an unwritable place (exit codes 2 to 4) drops the lines held in the
 /// first `HELD_FOR`: they concern work without a result.
-pub fn print_error(message: &str, error: &Error) {
+pub fn print_error(error: &Error) {
+    let message = match error {
+        Error::Cancelled if !crate::files::nothing_finished() => {
+            "stopped; what was finished is kept".to_owned()
+        }
+        error => error.to_string(),
+    };
     let exit_code = error.exit_code();
     static PRINTED: AtomicBool = AtomicBool::new(false);
     if PRINTED.swap(true, Ordering::SeqCst) {
@@ -56,7 +62,7 @@ pub fn print_error(message: &str, error: &Error) {
         2..=4 => drop(lock(&HELD).take()),
         _ => release(),
     }
-    let message = one_line(message);
+    let message = one_line(&message);
     match as_json() {
         true => {
             write_event("error", json!({ "message": message, "kind": error.kind(), "exit_code": exit_code }))
@@ -214,12 +220,11 @@ pub fn stop_without_error() {
 
 /// Ends the process as [`Error::Cancelled`] does, regardless of its threads.
 fn exit_stopped() -> ! {
-    let nothing = crate::files::remove_unfinished();
-    let kept = "stopped; what was finished is kept".to_owned();
+    crate::files::remove_unfinished();
     let serves = SERVES.load(Ordering::SeqCst);
     let code = if serves { 0 } else { Error::Cancelled.exit_code() };
     if !serves {
-        print_error(&if nothing { Error::Cancelled.to_string() } else { kept }, &Error::Cancelled);
+        print_error(&Error::Cancelled);
     }
     // Exit handlers would unload libraries that threads are running in.
     #[cfg(all(target_os = "linux", target_env = "gnu"))]

@@ -3,7 +3,7 @@ use super::args::{DeviceArgs, ViewArgs};
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
-use super::serve::{Answer, LiveSite, ServerAddress, Site, serve};
+use super::serve::{Answer, ServerAddress, Site, serve};
 use crate::format::scene_dir::Scene;
 use crate::format::scene_photos;
 use crate::gpu;
@@ -29,7 +29,7 @@ const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 
 pub fn view(args: &ViewArgs) -> Result<()> {
     let ViewArgs { scene, port, device } = args;
-    Shown::open(scene, *port, device, &[])?.serve(device.json, &|_| Ok(()))
+    Shown::open(scene, *port, device, &[])?.serve(device.json)
 }
 
 /// A scene that is prepared to be served.
@@ -39,6 +39,8 @@ pub struct Shown<'a> {
     /// Queries that the page offers.
     suggested: &'a [String],
     server: ServerAddress,
+    /// Time stamp of the scene that a run is to replace.
+    before: Option<SystemTime>,
     prepared: Prepared,
 }
 
@@ -58,8 +60,9 @@ impl<'a> Shown<'a> {
     pub fn open(path: &'a Path, port: u16, device: &'a DeviceArgs, suggested: &'a [String]) -> Result<Self> {
         // The port is bound first: one that is in use is reported before the scene is prepared.
         let server = ServerAddress::bind(port)?;
+        let before = written(path);
         let prepared = Prepared::load(path, device, suggested)?;
-        Ok(Shown { path, device, suggested, server, prepared })
+        Ok(Shown { path, device, suggested, server, before, prepared })
     }
 
     /// Address of the page.
@@ -67,9 +70,9 @@ impl<'a> Shown<'a> {
         self.server.url()
     }
 
-    /// Serves until the user or the parent process ends it. `each` is called between questions.
-    pub fn serve(self, as_json: bool, each: &dyn Fn(&LiveSite) -> Result<()>) -> Result<()> {
-        let Shown { path, device, suggested, server, prepared } = self;
+    /// Serves until the user or the parent process ends it.
+    pub fn serve(self, as_json: bool) -> Result<()> {
+        let Shown { path, device, suggested, server, before, prepared } = self;
         let Prepared { site, mut ready, mut preview } = prepared;
         let options = Compat::answers(None, path)?;
         let (address, answers) = (server.url(), site.answers_questions);
@@ -97,7 +100,6 @@ impl<'a> Shown<'a> {
                 }
                 Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {}
             }
-            each(&live)?;
             if preview.is_none() || looked.elapsed() < LOOK_INTERVAL {
                 continue;
             }
@@ -112,13 +114,13 @@ impl<'a> Shown<'a> {
                         preview = Some(stamp);
                     }
                 }
-                // The run is over; without a scene the preview stays.
-                None if path.exists() => {
+                // The run is over; without a new scene the preview stays.
+                None if written(path).is_some_and(|time| Some(time) != before) => {
                     let last = Prepared::load(path, device, suggested)?;
                     live.replace(last.site);
                     (ready, preview) = (last.ready, last.preview);
                 }
-                None => live.say("The run ended without a scene."),
+                None => live.say("The run ended without a scene; this is its last preview."),
             }
         }
         Ok(())
@@ -127,7 +129,12 @@ impl<'a> Shown<'a> {
 
 /// Time stamp of the preview of a scene that a run is making.
 fn stamp(scene: &Path) -> Option<SystemTime> {
-    preview::of_running(scene)?.join("scene.json").metadata().ok()?.modified().ok()
+    written(&preview::of_running(scene)?)
+}
+
+/// Time stamp of a scene.
+fn written(scene: &Path) -> Option<SystemTime> {
+    scene.join("scene.json").metadata().ok()?.modified().ok()
 }
 
 impl Prepared {

@@ -14,7 +14,7 @@ pub(crate) struct Candidate {
     pub physical: vk::PhysicalDevice,
     pub properties: vk::PhysicalDeviceProperties,
     pub name: String,
-    /// The same for every driver of the card; `nvidia-smi -L` prints it, too.
+    /// Equal for every driver of the card; `nvidia-smi -L` prints it, too.
     pub uuid: [u8; 16],
     /// Where the driver reports it.
     pub pci: Option<Pci>,

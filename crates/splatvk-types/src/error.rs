@@ -213,10 +213,9 @@ impl From<splatvk_gpu::Error> for Error {
 /// Advice for a place that cannot be written.
 fn elsewhere(e: &std::io::Error) -> &'static str {
     match advice(e) {
-        // The path does not exist yet: it was about to be created.
-        _ if is_no_place(e) => "; choose another folder",
-        "" => "; choose another folder",
-        advice => advice,
+        // "check the name" does not fit a path that was about to be created.
+        advice if !advice.is_empty() && !is_no_place(e) => advice,
+        _ => "; choose another folder",
     }
 }
 

@@ -17,7 +17,7 @@ pub use home::home;
 #[doc(hidden)]
 pub use owner::leave;
 pub use owner::{Found, Held, look};
-pub use partial::{HIDDEN, leftovers, remove_leftover, remove_unfinished};
+pub use partial::{HIDDEN, leftovers, note_finished, nothing_finished, remove_leftover, remove_unfinished};
 pub use partial::{Partial, check_free, check_free_inside, is_leftover, restore, sweep};
 pub use place::{Kind, check_place, check_spared, foreign, listed, next_free};
 pub use program::{installed, own_file};

@@ -13,8 +13,18 @@ use std::time::{Duration, Instant};
 const POLL: Duration = Duration::from_millis(50);
 /// Time between the request to end and the end by force.
 const GRACE: Duration = Duration::from_secs(5);
-/// The same after Ctrl-C: this process itself ends a second later, and the tables come before.
+/// Such a time after Ctrl-C: this process itself ends a second later, and the tables come before.
 const STOP_GRACE: Duration = Duration::from_millis(400);
+
+/// Variables with paths, which may be relative to the current folder of this process.
+const PATHS: [&str; 6] = [
+    "SPLATVK_HOME",
+    "SPLATVK_MODELS",
+    "ORT_DYLIB_PATH",
+    "SPLATVK_LIBHEIF",
+    "VK_DRIVER_FILES",
+    "VK_ICD_FILENAMES",
+];
 
 /// End of an attempt.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,7 +52,7 @@ pub enum Ending {
 /// in, which states its path.
 pub fn program() -> Result<PathBuf> {
     match std::env::var_os("SPLATVK_PROGRAM").filter(|p| !p.is_empty()) {
-        Some(path) => Ok(path.into()),
+        Some(path) => std::path::absolute(&path).map_err(Error::io(PathBuf::from(path))),
         None => std::env::current_exe().map_err(Error::io("the path of this program")),
     }
 }
@@ -51,6 +61,14 @@ pub fn program() -> Result<PathBuf> {
 pub fn command(program: &Path, base: &Path, arguments: &[&str]) -> Command {
     let mut command = Command::new(program);
     command.args(["batch-row", "--log", "json"]).args(arguments).current_dir(base);
+    for name in PATHS {
+        let Some(value) = std::env::var_os(name).filter(|v| !v.is_empty()) else { continue };
+        let absolute = std::env::split_paths(&value).map(std::path::absolute);
+        // A list that was read from a variable can be joined again.
+        if let Ok(joined) = std::env::join_paths(absolute.filter_map(std::io::Result::ok)) {
+            command.env(name, joined);
+        }
+    }
     // Ctrl-C reaches this process, which ends its children; they end with it in any case.
     command.process_group(0);
     #[cfg(target_os = "linux")]

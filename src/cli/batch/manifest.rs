@@ -41,11 +41,12 @@ pub struct Manifest {
 }
 
 impl Manifest {
-    /// Reads a file of rows, standard input (`-`), or a folder, whose folders become rows.
+    /// Reads a file of rows, standard input (`-`), or a folder, whose folders become rows, but not
+    /// that of the results, `out`.
     ///
     /// # Errors
     /// A file that cannot be read, no row, or a wrong one; the message has its line.
-    pub fn read(place: &Path) -> Result<Manifest> {
+    pub fn read(place: &Path, out: &Path) -> Result<Manifest> {
         let base = match place.parent() {
             _ if place == Path::new("-") => PathBuf::from("."),
             _ if place.is_dir() => place.to_path_buf(),
@@ -57,7 +58,7 @@ impl Manifest {
             std::io::stdin().read_to_string(&mut text).map_err(Error::io("standard input"))?;
             json_lines(&text, place)?
         } else if place.is_dir() {
-            folders(place)?
+            folders(place, out)?
         } else if place.extension().is_some_and(|e| e.eq_ignore_ascii_case("csv")) {
             table(&files::read_text(place)?, place)?
         } else {
@@ -119,15 +120,16 @@ fn table(text: &str, place: &Path) -> Result<Vec<Row>> {
     Ok(rows)
 }
 
-/// A row per folder; hidden ones are left out.
-fn folders(place: &Path) -> Result<Vec<Row>> {
+/// A row per folder; hidden ones and `out` are left out.
+fn folders(place: &Path, out: &Path) -> Result<Vec<Row>> {
+    let out = out.canonicalize().ok();
     let entries = std::fs::read_dir(place).map_err(Error::io(place))?;
     let mut rows = Vec::new();
     for entry in entries {
         let path = entry.map_err(Error::io(place))?.path();
         let Some(name) = path.file_name().filter(|_| path.is_dir()) else { continue };
         let name = name.to_string_lossy().into_owned();
-        if name.starts_with('.') {
+        if name.starts_with('.') || out.is_some() && path.canonicalize().ok() == out {
             continue;
         }
         let row = checked(Row {
@@ -225,7 +227,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join(name);
         std::fs::write(&file, text).unwrap();
-        Manifest::read(&file)
+        Manifest::read(&file, Path::new("out"))
     }
 
     fn refused(name: &str, text: &str) -> String {
@@ -283,10 +285,12 @@ mod tests {
             std::fs::create_dir(folder.path().join(name)).unwrap();
         }
         std::fs::write(folder.path().join("notes.txt"), "x").unwrap();
-        let made = Manifest::read(folder.path()).unwrap();
+        std::fs::create_dir(folder.path().join("results")).unwrap();
+        let read = || Manifest::read(folder.path(), &folder.path().join("results"));
+        let made = read().unwrap();
         let ids: Vec<&str> = made.rows.iter().map(|r| r.id.as_str()).collect();
         assert_eq!((ids.as_slice(), made.base.as_path()), (&["a", "b"][..], folder.path()));
         std::fs::create_dir(folder.path().join("c d")).unwrap();
-        assert!(Manifest::read(folder.path()).unwrap_err().to_string().contains("rename the folder"));
+        assert!(read().unwrap_err().to_string().contains("rename the folder"));
     }
 }

@@ -43,7 +43,7 @@ pub struct BatchArgs {
     /// Folder of the results: ID/_SUCCESS.json, ID/scene, ID/exports, summary.csv, index.html
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Machine, or cluster (with the Python package splatvk[batch]), that works
+    /// Machine, or cluster, that works; a cluster needs the Python package with its extra batch
     #[arg(long, value_enum, default_value = "local")]
     pub engine: Engine,
     /// Devices that work side by side: all GPUs, or a list as of --device, separated by commas
@@ -141,7 +141,7 @@ pub fn batch(args: &BatchArgs) -> Result<()> {
         // `hand_over` saw it before the options were parsed, unless it stands elsewhere.
         return Err(Error::input("--engine ray belongs behind batch: splatvk batch --engine ray ..."));
     }
-    let manifest = Manifest::read(&args.manifest)?;
+    let manifest = Manifest::read(&args.manifest, &args.out)?;
     let rows = chosen_rows(args, &manifest);
     let devices = devices(&args.devices)?;
     let store = Store::at(&args.out)?;
@@ -175,17 +175,22 @@ fn only<'a>(args: &BatchArgs, rows: Vec<&'a Row>, store: &Store) -> Vec<&'a Row>
 /// The devices of a list, each once.
 fn devices(list: &[String]) -> Result<Vec<BatchDevice>> {
     let survey = |choice: Option<&str>| splatvk_gpu::survey(&gpu::options(choice)).map_err(Error::from);
-    let of = |info: splatvk_gpu::DeviceInfo| BatchDevice {
-        choice: format!("uuid:{}", info.uuid),
-        name: info.name,
-        is_cpu: info.is_cpu,
+    let all = survey(None)?;
+    let usable: Vec<_> =
+        all.devices.into_iter().enumerate().filter_map(|(i, d)| Some((i, d.info.ok()?))).collect();
+    let of = |info: splatvk_gpu::DeviceInfo| {
+        // Two drivers of one card report one UUID.
+        let mut alike = usable.iter().filter(|(_, other)| other.uuid == info.uuid);
+        let index = alike.clone().find(|(_, other)| other.driver == info.driver).map(|(i, _)| i.to_string());
+        let is_unique = alike.nth(1).is_none();
+        let choice = index.filter(|_| !is_unique).unwrap_or_else(|| format!("uuid:{}", info.uuid));
+        BatchDevice { choice, name: info.name, is_cpu: info.is_cpu }
     };
     let found: Vec<BatchDevice> = if list.is_empty() {
-        vec![of(survey(None)?.chosen?)]
+        vec![of(all.chosen?)]
     } else if list == ["all"] {
-        let all = survey(None)?;
-        let usable = all.devices.into_iter().filter_map(|d| d.info.ok());
-        let gpus: Vec<_> = usable.filter(|info| !info.is_cpu).map(of).collect();
+        let gpus = usable.iter().map(|(_, info)| info).filter(|info| !info.is_cpu);
+        let gpus: Vec<_> = gpus.cloned().map(of).collect();
         if gpus.is_empty() { vec![of(all.chosen?)] } else { gpus }
     } else {
         list.iter().map(|choice| Ok(of(survey(Some(choice))?.chosen?))).collect::<Result<_>>()?

@@ -234,10 +234,11 @@ impl<'a> Queue<'a> {
         self.store.event(name, fields)?;
         self.store.fail(&failure, Some((&folder, &log)))?;
         if failure.kind == FailureKind::Unwritable {
-            return Err(Error::Unwritable {
-                path: self.store.place(id),
-                source: std::io::Error::other(failure.message),
-            });
+            // The message without what is said again around it.
+            let words = failure.message.rsplit(": cannot be written: ").next().unwrap_or_default();
+            let words = words.split(';').next().unwrap_or_default();
+            let source = std::io::Error::other(words.to_owned());
+            return Err(Error::Unwritable { path: self.store.place(id), source });
         }
         match again {
             Some(max_size) => {

@@ -4,7 +4,7 @@
 //! `_attempts` holds unfinished work, and `events.jsonl` is only appended to.
 use super::child::Ending;
 use super::row::SUCCESS;
-use crate::files::{Partial, swap};
+use crate::files::{self, Partial, swap};
 use crate::sync::lock;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
@@ -104,7 +104,7 @@ pub struct Store {
     events: Mutex<Option<File>>,
 }
 
-/// A row that this process works on; others find it locked.
+/// A row or a file that this process works on; others find it locked.
 pub struct Claim {
     file: File,
     path: PathBuf,
@@ -195,12 +195,27 @@ impl Store {
     /// Locks a row against other processes and removes what a killed one has left; `None` if
     /// another process has it.
     pub fn claim(&self, id: &str) -> Result<Option<Claim>> {
-        let path = self.root.join(ATTEMPTS).join(format!("{id}.lock"));
+        let claim = self.lock(id, false)?;
+        claim.is_some().then(|| self.sweep(id)).transpose()?;
+        Ok(claim)
+    }
+
+    /// Does short work on files of all rows while no other process of the batch does.
+    pub fn alone<T>(&self, work: impl FnOnce() -> Result<T>) -> Result<T> {
+        // No row has this name.
+        let _claim = self.lock("_files", true)?;
+        work()
+    }
+
+    /// Locks a name; unless it is to wait, `None` if another process has it.
+    fn lock(&self, name: &str, wait: bool) -> Result<Option<Claim>> {
+        let path = self.root.join(ATTEMPTS).join(format!("{name}.lock"));
         loop {
             let file = OpenOptions::new().create(true).truncate(false).write(true).open(&path);
             let file = file.map_err(Error::unwritable(&path))?;
             match file.try_lock() {
                 Ok(()) => {}
+                Err(std::fs::TryLockError::WouldBlock) if wait => file.lock().map_err(Error::io(&path))?,
                 Err(std::fs::TryLockError::WouldBlock) => return Ok(None),
                 Err(std::fs::TryLockError::Error(e)) => return Err(Error::io(&path)(e)),
             }
@@ -209,7 +224,6 @@ impl Store {
             if let (Ok(a), Ok(b)) = (file.metadata(), path.metadata())
                 && same(a, b)
             {
-                self.sweep(id)?;
                 return Ok(Some(Claim { file, path }));
             }
         }
@@ -249,6 +263,7 @@ impl Store {
             remove(attempt)?;
             remove(&aside)?;
         }
+        files::note_finished();
         self.forget_failure(id)
     }
 
@@ -266,14 +281,12 @@ impl Store {
             remove(folder)?;
         }
         let text = format!("{:#}\n", json!(failure));
-        write(&place, text.as_bytes())
+        self.alone(|| write(&place, text.as_bytes()))
     }
 
     /// Writes a file of the batch whole.
-    pub fn write(&self, name: &str, text: &[u8]) -> Result<PathBuf> {
-        let place = self.root.join(name);
-        write(&place, text)?;
-        Ok(place)
+    pub fn write(&self, name: &str, text: &[u8]) -> Result<()> {
+        write(&self.root.join(name), text)
     }
 }
 
@@ -359,5 +372,25 @@ mod tests {
         drop(claim);
         assert!(store.claim("a").unwrap().is_some());
         assert!(!names(&folder.path().join(ATTEMPTS)).contains(&"a.lock".to_owned()));
+    }
+
+    #[test]
+    fn tables_are_written_one_after_the_other() {
+        let folder = tempfile::tempdir().unwrap();
+        Store::at(folder.path()).unwrap().open("events.jsonl").unwrap();
+        std::thread::scope(|scope| {
+            for shard in 0..4 {
+                let place = folder.path();
+                scope.spawn(move || {
+                    let store = Store::at(place).unwrap();
+                    for _ in 0..50 {
+                        store.alone(|| store.write("summary.csv", &[b'0' + shard; 1000])).unwrap();
+                    }
+                });
+            }
+        });
+        let table = std::fs::read(folder.path().join("summary.csv")).unwrap();
+        assert!(table.len() == 1000 && table.iter().all(|b| *b == table[0]));
+        assert_eq!(names(folder.path()), ["_attempts", "_failed", "events.jsonl", "summary.csv"]);
     }
 }

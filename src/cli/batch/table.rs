@@ -49,10 +49,12 @@ const COLUMNS: [&str; 12] = [
 
 /// Writes the table and the page of all rows.
 pub fn write(manifest: &Manifest, store: &Store) -> Result<()> {
-    let states = states(manifest, store);
-    store.write("summary.csv", &csv(&states)?)?;
-    store.write("index.html", page(&states).as_bytes())?;
-    Ok(())
+    // Shards may end at the same moment: the last to write has seen the rows of all.
+    store.alone(|| {
+        let states = states(manifest, store);
+        store.write("summary.csv", &csv(&states)?)?;
+        store.write("index.html", page(&states).as_bytes())
+    })
 }
 
 fn csv(states: &[RowState<'_>]) -> Result<Vec<u8>> {

@@ -2,6 +2,8 @@
 // go out and come back with their number.
 
 const waiting = new Map();
+/// Longest wait for an answer, ms: a notebook answers when the cell that runs has ended.
+const PATIENCE = 300_000;
 let number = 0;
 
 /// Sends a message to the outer page. A frame of `srcdoc` has no origin of its own to name.
@@ -12,8 +14,12 @@ export function tellOuter(message) {
 /// Asks the outer page; resolves to {ok, body} as a server answers.
 export function askOuter(text) {
   return new Promise((resolve) => {
-    waiting.set(++number, resolve);
-    tellOuter({ ask: text, number });
+    const own = ++number;
+    waiting.set(own, resolve);
+    tellOuter({ ask: text, number: own });
+    setTimeout(() => {
+      if (waiting.delete(own)) resolve({ ok: false, body: { error: "No answer from the page around this one." } });
+    }, PATIENCE);
   });
 }
 

@@ -10,22 +10,23 @@ const LOOK = 1500;
 export function follow(manifest, { renew, say, leave }) {
   let [page, scene, notice] = [null, 0, ""];
   const look = async () => {
+    let now;
     try {
-      const reply = await fetch("state"), now = await reply.json();
-      page ??= now.page;
-      // The finished page may have come before the first look.
-      if (now.page !== page || !now.preview) {
-        leave();
-        return location.reload();
-      }
-      if (now.scene !== scene) {
-        scene = now.scene;
-        await renew();
-      }
-      if (now.notice && now.notice !== notice) say((notice = now.notice));
+      now = await (await fetch("state")).json();
     } catch {
       return say("The server has ended; this is the last it showed.");
     }
+    page ??= now.page;
+    // The finished page may have come before the first look.
+    if (now.page !== page || !now.preview) {
+      leave();
+      return location.reload();
+    }
+    if (now.scene !== scene) {
+      scene = now.scene;
+      await renew().catch((error) => say(`The new splats could not be shown: ${error.message}`));
+    }
+    if (now.notice && now.notice !== notice) say((notice = now.notice));
     setTimeout(look, LOOK);
   };
   setTimeout(look, LOOK);
@@ -38,14 +39,20 @@ export const kept = {
   put({ camera }) {
     const { rotation, position, focal, shift, ratio, aspect, distance, cover } = camera;
     const state = { rotation, position, focal, shift, ratio, aspect, distance, cover };
-    sessionStorage.setItem(KEY, JSON.stringify({ state, at: location.pathname }));
+    try {
+      sessionStorage.setItem(KEY, JSON.stringify({ state, at: location.pathname }));
+    } catch {
+      // Without storage the next page begins with its own camera.
+    }
   },
   take(motion) {
-    // A report that is opened as a file may have no storage.
-    const text = location.protocol.startsWith("http") ? sessionStorage.getItem(KEY) : null;
-    if (!text) return;
-    sessionStorage.removeItem(KEY);
-    const { state, at } = JSON.parse(text);
-    if (at === location.pathname) motion.goTo(new Camera(state), -1, true);
+    let found;
+    try {
+      found = JSON.parse(sessionStorage.getItem(KEY));
+      sessionStorage.removeItem(KEY);
+    } catch {
+      // A report that is opened as a file, or in a frame, may have no storage.
+    }
+    if (found?.at === location.pathname) motion.goTo(new Camera(found.state), -1, true);
   },
 };

@@ -264,7 +264,7 @@ class Test:
         starts = sum(d.starts for d in drivers)
         print(f"round {number}: {wall:.0f} s, {starts} drivers", flush=True)
         left = self.attempts(out, fs)
-        # What killed workers had uploaded goes once its lease and the time of grace are over.
+        # Uploads of killed workers go once their lease and the time of grace are over.
         time.sleep(2 * LEASE + 1)
         last = Driver(f"last-{number}", self.base, arguments)
         last.process.wait()
@@ -355,7 +355,7 @@ def run(options, base):
             print(f"round {number}: {left} abandoned attempts before the last driver (exit code {code}); "
                   f"wrong: {found or 'nothing'}", flush=True)
             wrong += found
-        # What a worker left that was killed with its keeper, the next row on the node deletes.
+        # The next row on the node deletes the files of a worker that was killed with its keeper.
         clear_scratch(base / "scratch")
         scratch = list((base / "scratch").iterdir())
         wrong += [f"scratch folder {p} is left" for p in scratch]

@@ -88,7 +88,7 @@ def test_remote_inputs_are_fetched(row, photos, scratch, tmp_path, s3):
     for entry in (f"s3://{base}", f"s3://{base}/*.jpg", [f"s3://{base}/{n}.jpg" for n in range(3)]):
         place = str(tmp_path / "b")
         outcome = run_row({**row, "input": entry}, place, scratch=str(scratch))
-        # The same photos by another address have the same key.
+        # Equal photos have one key, whatever their address.
         assert outcome["state"] in ("done", "skipped") and outcome["key"] == local["key"], outcome
         assert {f[0] for f in success_of(place)["source"]["files"]} == {f"s3://{base}/{n}.jpg" for n in range(3)}
     none = run_row({**row, "input": f"s3://{base}/*.png"}, str(tmp_path / "b"), scratch=str(scratch))

@@ -95,7 +95,7 @@ impl Partial {
     pub fn finish<E>(self, rename: impl FnOnce(&Path) -> Result<(), E>) -> Result<(), E> {
         self.keep(|path| {
             rename(path)?;
-            FINISHED.store(true, Ordering::SeqCst);
+            note_finished();
             Ok(())
         })
     }
@@ -196,18 +196,21 @@ pub fn restore(place: &Path) {
     }
 }
 
-/// Removes all unfinished outputs of this process, for exits that run no destructors; returns
-/// whether no requested output had been finished before.
-pub fn remove_unfinished() -> bool {
+/// Removes all unfinished outputs of this process, for exits that run no destructors.
+pub fn remove_unfinished() {
     for (hidden, made) in unfinished().drain(..) {
         let _ = owner::clear(&hidden);
         remove_empty(&made);
     }
-    nothing_finished()
+}
+
+/// Records that this process has finished an output that a user requested.
+pub fn note_finished() {
+    FINISHED.store(true, Ordering::SeqCst);
 }
 
 /// Whether this process has finished no requested output.
-fn nothing_finished() -> bool {
+pub fn nothing_finished() -> bool {
     !FINISHED.load(Ordering::SeqCst)
 }
 
