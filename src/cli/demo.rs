@@ -23,7 +23,7 @@ const PHOTOS: [(&str, &[u8]); 4] = [
     ("table_4.jpg", include_bytes!("../../tests/data/breakfast/images/train_03.jpg")),
 ];
 /// Three things on the table, and one that is not there.
-const QUERIES: [&str; 4] = ["lemon", "loaf of bread", "blue mug", "green apple"];
+const QUERIES: [&str; 4] = ["yellow lemon", "loaf of bread", "blue mug", "green apple"];
 
 /// Longer side of the working images on a CPU device, pixels: a quarter of the work of the photos'.
 const CPU_SIZE: usize = 320;
