@@ -1,10 +1,20 @@
-"""Asks a scene for three things: run by tools/test-packages in a bare system with the scene as argument."""
+"""Makes a scene of photos and asks it, and asks the scene of the command line: run by tools/test-packages in a bare system.
+
+python test-packages.py PHOTOS SCENE
+"""
 
 import sys
+import time
 
-import splatvk
+begin = time.monotonic()
 
-scene = splatvk.load(sys.argv[1])
+import splatvk  # noqa: E402
+
+answer = splatvk.reconstruct(sys.argv[1], preset="draft", max_size=320).query("yellow lemon")
+print(f"{answer!r} {time.monotonic() - begin:.0f} s after the start")
+assert answer.presence == "found", answer
+
+scene = splatvk.load(sys.argv[2])
 print(scene)
 for text, there in [("lemon", True), ("blue mug", True), ("green apple", False)]:
     answer = scene.query(text)
