@@ -7,7 +7,7 @@ use fixture::view::{Server, breakfast};
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader};
 use std::net::TcpStream;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
@@ -287,18 +287,36 @@ impl Drop for Running {
     }
 }
 
-#[test]
-fn view_of_running_run_is_a_preview() {
+/// A training with a preview, its message about it, and the later events.
+fn training(out: &Path) -> (Running, Value, impl Iterator<Item = Value>) {
     let (images, cameras, points) = fixture::small_views();
-    let folder = tempfile::tempdir().unwrap();
-    let out = folder.path().join("a scene");
     let mut train = Command::new(env!("CARGO_BIN_EXE_splatvk"));
     train.arg("train").arg("--images").arg(images).arg("--cameras").arg(cameras).arg("--points").arg(points);
-    train.args(["--iterations", "30000", "--log", "json", "--out"]).arg(&out).stderr(Stdio::piped());
+    train
+        .args(["--iterations", "30000", "--force", "--log", "json", "--out"])
+        .arg(out)
+        .stderr(Stdio::piped());
     let mut run = Running(train.spawn().unwrap());
     let lines = BufReader::new(run.0.stderr.take().unwrap()).lines().map_while(Result::ok);
     let mut events = lines.map(|line| serde_json::from_str::<Value>(&line).unwrap());
     let offer = events.find(|e| e["message"].as_str().is_some_and(|m| m.contains("preview"))).unwrap();
+    (run, offer, events)
+}
+
+/// Waits until the page is told that the run has ended.
+fn wait_for_end(server: &Server) {
+    let begun = Instant::now();
+    while !server.request("GET", "state", "", "").1.contains("ended without a scene") {
+        assert!(begun.elapsed() < Duration::from_secs(30), "the page is told that the run ended");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
+#[test]
+fn view_of_running_run_is_a_preview() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("a scene");
+    let (run, offer, mut events) = training(&out);
     assert_eq!(
         offer["message"],
         format!("look at a preview meanwhile: splatvk view '{}'", out.display()),
@@ -314,13 +332,22 @@ fn view_of_running_run_is_a_preview() {
     assert!(status == 200 && page.contains("\"renews\":true"), "{status}");
     drop(run);
     assert_eq!(server.request("GET", "scene.bin", "", "").0, 200, "the preview stays in memory");
-    let told = || server.request("GET", "state", "", "").1.contains("ended without a scene");
-    let begun = std::time::Instant::now();
-    while !told() {
-        assert!(begun.elapsed() < Duration::from_secs(30), "the page is told that the run ended");
-        std::thread::sleep(Duration::from_millis(100));
-    }
+    wait_for_end(&server);
     // A stopped run has no preview: the next command says that there is no scene.
     let view = Command::new(env!("CARGO_BIN_EXE_splatvk")).arg("view").arg(&out).output().unwrap();
     assert_eq!(view.status.code(), Some(2));
+}
+
+#[test]
+fn view_takes_no_old_scene_for_that_of_the_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("scene");
+    let copied = Command::new("cp").arg("-r").arg(scene()).arg(&out).status().unwrap();
+    assert!(copied.success());
+    let (run, ..) = training(&out);
+    let server = Server::start(&out);
+    drop(run);
+    wait_for_end(&server);
+    let (_, page) = server.request("GET", "", "", "");
+    assert!(page.contains("\"renews\":true"), "the preview stays");
 }
