@@ -24,7 +24,6 @@ from collections import Counter
 from pathlib import Path
 
 import s3_server
-
 from splatvk.batch._program import clear_scratch
 
 HERE = Path(__file__).parent
@@ -86,8 +85,15 @@ class Node:
         where = ["--head", f"--port={RAY_PORT}", "--include-dashboard=false", f"--temp-dir={base}/ray"]
         arguments = where if head else [f"--address=127.0.0.1:{RAY_PORT}"]
         self.base, self.head = base, head
-        self.command = [str(Path(sys.executable).with_name("ray")), "start", *arguments, "--block", "--num-cpus=2",
-                        "--node-ip-address=127.0.0.1", "--object-store-memory=80000000"]
+        self.command = [
+            str(Path(sys.executable).with_name("ray")),
+            "start",
+            *arguments,
+            "--block",
+            "--num-cpus=2",
+            "--node-ip-address=127.0.0.1",
+            "--object-store-memory=80000000",
+        ]
         self.start()
 
     def start(self):
@@ -132,7 +138,9 @@ class Driver:
         self.starts += 1
         self.log = self.base / f"driver-{self.name}-{self.starts}.log"
         with open(self.log, "wb") as log:
-            self.process = subprocess.Popen([sys.executable, "-m", "splatvk.batch", *self.arguments], stdout=log, stderr=log)
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "splatvk.batch", *self.arguments], stdout=log, stderr=log
+            )
 
 
 def kill(pid):
@@ -164,8 +172,13 @@ class Test:
                 folder.mkdir(parents=True)
                 for photo in range(3):
                     (folder / f"{photo}.jpg").write_bytes(f"{name} {photo}".encode() * 1000)
-            row = {"id": name, "input": str(folder), "options": self.row_options(number), "queries": [],
-                   "exports": ["glb"]}
+            row = {
+                "id": name,
+                "input": str(folder),
+                "options": self.row_options(number),
+                "queries": [],
+                "exports": ["glb"],
+            }
             if number == 7:
                 row["options"] = {"colour": 1}
             elif number == 13:
@@ -178,11 +191,21 @@ class Test:
 
     def row_options(self, number):
         if self.options.captures:
-            return {"preset": "draft", "deterministic": True, "max_size": 160, "iterations": 60, "seed": number}
+            return {
+                "preset": "draft",
+                "deterministic": True,
+                "max_size": 160,
+                "iterations": 60,
+                "seed": number,
+            }
         return {"seconds": round(self.random.uniform(3, 7), 2)}
 
     def hanging(self):
-        return {**self.row_options(0), "iterations": 10_000_000} if self.options.captures else {"hang": 1, "child": 1}
+        return (
+            {**self.row_options(0), "iterations": 10_000_000}
+            if self.options.captures
+            else {"hang": 1, "child": 1}
+        )
 
     def reference(self, row, folder):
         """Digests of what one machine makes of the row, by path."""
@@ -191,8 +214,12 @@ class Test:
         local = {**row, "input": [str(folder)]}
         if not self.options.captures:
             local["options"] = {}
-        done = subprocess.run([self.options.program, "batch-row", "--out", str(out)], input=json.dumps(local), text=True,
-                              capture_output=True)
+        done = subprocess.run(
+            [self.options.program, "batch-row", "--out", str(out)],
+            input=json.dumps(local),
+            text=True,
+            capture_output=True,
+        )
         if done.returncode:
             raise SystemExit(f"reference of {row['id']}: {done.stderr}")
         files = {p.relative_to(out).as_posix(): p for p in out.rglob("*") if p.is_file()}
@@ -203,12 +230,20 @@ class Test:
         """What can be killed now, by kind."""
         table = processes()
         keepers = [p for p, (_, line) in table.items() if "_keeper.py" in line]
-        programs = [p for p, (parent, line) in table.items() if parent in keepers and "batch-row --out" in line]
+        programs = [
+            p for p, (parent, line) in table.items() if parent in keepers and "batch-row --out" in line
+        ]
         # Most moments are those of the program; a worker also fetches, uploads and commits.
         busy = [p for n in nodes for p in n.members("ray::splatvk", table)] if programs else []
         raylets = [p for p in nodes[1].members("raylet_socket_name", table)] if busy else []
         running = [d.process.pid for d in drivers if d.process.poll() is None] if busy else []
-        return {"worker": busy, "raylet": raylets, "driver": running, "program": programs, "keeper": keepers}, set(programs)
+        return {
+            "worker": busy,
+            "raylet": raylets,
+            "driver": running,
+            "program": programs,
+            "keeper": keepers,
+        }, set(programs)
 
     def kill_one(self, nodes, drivers):
         found, programs = self.targets(nodes, drivers)
@@ -234,7 +269,10 @@ class Test:
         took = time.monotonic() - begin
         self.gone[kind] = max(self.gone.get(kind, 0.0), took if doomed else 0.0)
         self.table.append((kind, len(doomed), took))
-        print(f"  kill {sum(self.kills.values()):2}: {kind:8} {len(doomed)} below it, gone after {took:.2f} s", flush=True)
+        print(
+            f"  kill {sum(self.kills.values()):2}: {kind:8} {len(doomed)} below it, gone after {took:.2f} s",
+            flush=True,
+        )
 
     def revive(self, nodes, drivers):
         if nodes[1].lost():
@@ -248,9 +286,25 @@ class Test:
     def round(self, number, nodes, manifest, fs):
         """Two drivers on a fresh output, until both have ended by themselves."""
         out = f"s3://scenes/round-{number}"
-        arguments = [str(manifest), "--out", out, "--address", f"127.0.0.1:{RAY_PORT}", "--cpus-per-row", "1", "--retries",
-                     "30", "--timeout", str(self.options.timeout), "--lease", str(LEASE), "--scratch",
-                     str(self.base / "scratch"), "--log", "json"]
+        arguments = [
+            str(manifest),
+            "--out",
+            out,
+            "--address",
+            f"127.0.0.1:{RAY_PORT}",
+            "--cpus-per-row",
+            "1",
+            "--retries",
+            "30",
+            "--timeout",
+            str(self.options.timeout),
+            "--lease",
+            str(LEASE),
+            "--scratch",
+            str(self.base / "scratch"),
+            "--log",
+            "json",
+        ]
         drivers = [Driver(f"{name}-{number}", self.base, arguments) for name in "ab"]
         begin = time.monotonic()
         next_kill = begin + self.random.uniform(4, 10)
@@ -312,7 +366,9 @@ class Test:
             made = {p.removeprefix(top + "/"): hashlib.sha256(fs.cat(p)).hexdigest() for p in fs.find(top)}
             made = {name: digest for name, digest in made.items() if name not in TIMED}
             if made != references[name]:
-                different = sorted(p for p in {*made, *references[name]} if made.get(p) != references[name].get(p))
+                different = sorted(
+                    p for p in {*made, *references[name]} if made.get(p) != references[name].get(p)
+                )
                 wrong.append(f"{name}: other bits in {', '.join(different[:5])} of {len(made)} files")
         if self.attempts(out, fs):
             wrong.append(f"{self.attempts(out, fs)} leftover attempts")
@@ -331,7 +387,7 @@ def run(options, base):
         "FAKE_SPLATVK_STATE": str(base),
     }
     os.environ.update(environment)
-    server = subprocess.Popen([sys.executable, str(HERE / "s3_server.py"), str(S3_PORT)])
+    subprocess.Popen([sys.executable, str(HERE / "s3_server.py"), str(S3_PORT)])
     nodes, test = [], Test(options, base)
     try:
         import s3fs
@@ -341,7 +397,9 @@ def run(options, base):
         fs.mkdir("photos"), fs.mkdir("scenes")
         rows = test.rows(fs)
         failing = ("capture-07", "capture-13")
-        references = {row["id"]: test.reference(row, folder) for row, folder in rows if row["id"] not in failing}
+        references = {
+            row["id"]: test.reference(row, folder) for row, folder in rows if row["id"] not in failing
+        }
         manifest = base / "manifest.jsonl"
         manifest.write_text("".join(json.dumps(row) + "\n" for row, _ in rows))
         nodes.append(Node(base, head=True))
@@ -354,8 +412,11 @@ def run(options, base):
             number += 1
             out, left, code = test.round(number, nodes, manifest, fs)
             found = test.check(out, rows, references, fs)
-            print(f"round {number}: {left} abandoned attempts before the last driver (exit code {code}); "
-                  f"wrong: {found or 'nothing'}", flush=True)
+            print(
+                f"round {number}: {left} abandoned attempts before the last driver (exit code {code}); "
+                f"wrong: {found or 'nothing'}",
+                flush=True,
+            )
             wrong += found
         # The next row on the node deletes the files of a worker that was killed with its keeper.
         clear_scratch(base / "scratch")
@@ -365,10 +426,13 @@ def run(options, base):
         table = processes()
         for pid in below(os.getpid(), table):
             kill(pid)
-    print(f"\n| killed | times | slowest end of what it ran, s |\n|---|---|---|")
+    print("\n| killed | times | slowest end of what it ran, s |\n|---|---|---|")
     for kind, times in sorted(test.kills.items()):
         print(f"| {kind} | {times} | {test.gone.get(kind, 0.0):.2f} |")
-    print(f"{sum(test.kills.values())} kills in {number} rounds of {len(rows)} rows; wrong: {wrong or 'nothing'}")
+    print(
+        f"{sum(test.kills.values())} kills in {number} rounds of {len(rows)} rows; "
+        f"wrong: {wrong or 'nothing'}"
+    )
     return 1 if wrong else 0
 
 
@@ -381,7 +445,9 @@ def reachable(fs):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=24)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--program", default=str(HERE / "fake_splatvk"))

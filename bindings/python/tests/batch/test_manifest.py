@@ -1,7 +1,6 @@
 import json
 
 import pytest
-
 from splatvk import InputError
 from splatvk.batch._manifest import read, row_of, shard_of
 
@@ -12,7 +11,13 @@ def write(path, *rows):
 
 
 def test_json_lines_give_rows(tmp_path):
-    full = {"id": "a", "input": ["x/*.jpg", "s3://b/y"], "options": {"views": 4}, "queries": ["chair"], "exports": ["glb"]}
+    full = {
+        "id": "a",
+        "input": ["x/*.jpg", "s3://b/y"],
+        "options": {"views": 4},
+        "queries": ["chair"],
+        "exports": ["glb"],
+    }
     manifest = read(write(tmp_path / "m.jsonl", full, {"id": "b", "input": "/z"}))
     rows = {row["id"]: row for row in manifest.rows()}
     assert len(manifest) == 2
@@ -86,11 +91,15 @@ def test_shards_part_the_rows(tmp_path):
     [
         ({"SLURM_ARRAY_TASK_ID": "7", "SLURM_ARRAY_TASK_MIN": "5", "SLURM_ARRAY_TASK_COUNT": "4"}, (2, 4)),
         (
-            {"SLURM_ARRAY_TASK_ID": "9", "SLURM_ARRAY_TASK_MIN": "1", "SLURM_ARRAY_TASK_COUNT": "3",
-             "SLURM_ARRAY_TASK_STEP": "4"},
+            {
+                "SLURM_ARRAY_TASK_ID": "9",
+                "SLURM_ARRAY_TASK_MIN": "1",
+                "SLURM_ARRAY_TASK_COUNT": "3",
+                "SLURM_ARRAY_TASK_STEP": "4",
+            },
             (2, 3),
         ),
-                ({"AWS_BATCH_JOB_ARRAY_INDEX": "0", "AWS_BATCH_JOB_ARRAY_SIZE": "8"}, (0, 8)),
+        ({"AWS_BATCH_JOB_ARRAY_INDEX": "0", "AWS_BATCH_JOB_ARRAY_SIZE": "8"}, (0, 8)),
         ({"BATCH_TASK_INDEX": "1", "BATCH_TASK_COUNT": "2"}, (1, 2)),
     ],
 )

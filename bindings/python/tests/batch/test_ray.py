@@ -59,7 +59,9 @@ def test_rows_are_settled(tmp_path, manifest, cluster):
         {"id": "bad", "options": {"refuse": 1}},
         {"id": "none", "input": "/nowhere"},
     )
-    run = drive(tmp_path, path, "--address", cluster, "--cpus-per-row", "1", "--scratch", str(tmp_path / "scratch"))
+    run = drive(
+        tmp_path, path, "--address", cluster, "--cpus-per-row", "1", "--scratch", str(tmp_path / "scratch")
+    )
     assert run.returncode == 1, run.stderr
     out = tmp_path / "out"
     with open(out / "summary.csv") as file:
@@ -78,7 +80,9 @@ def test_rows_are_settled(tmp_path, manifest, cluster):
 
     dry = drive(tmp_path, path, "--dry-run")
     states = {line.split()[0]: line.split()[1] for line in dry.stdout.splitlines()[1:] if line[0] != " "}
-    assert [states[name] for name in ("good", "lost", "large", "bad", "none")] == ["done"] * 3 + ["refused"] * 2
+    assert [states[name] for name in ("good", "lost", "large", "bad", "none")] == ["done"] * 3 + [
+        "refused"
+    ] * 2
     assert "0 of 5 rows to do" in dry.stdout
 
 

@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 
 import pytest
-
 from splatvk.batch import _results, _row, run_row
 from splatvk.batch._program import Keeper, KeeperGone
 from splatvk.batch._store import open_store
@@ -90,7 +89,9 @@ def test_remote_inputs_are_fetched(row, photos, scratch, tmp_path, s3):
         outcome = run_row({**row, "input": entry}, place, scratch=str(scratch))
         # Equal photos have one key, whatever their address.
         assert outcome["state"] in ("done", "skipped") and outcome["key"] == local["key"], outcome
-        assert {f[0] for f in success_of(place)["source"]["files"]} == {f"s3://{base}/{n}.jpg" for n in range(3)}
+        assert {f[0] for f in success_of(place)["source"]["files"]} == {
+            f"s3://{base}/{n}.jpg" for n in range(3)
+        }
     none = run_row({**row, "input": f"s3://{base}/*.png"}, str(tmp_path / "b"), scratch=str(scratch))
     assert (none["kind"], none["exit_code"]) == ("refused", 2), none
 
@@ -145,14 +146,20 @@ def test_timeout_ends_the_group(row, scratch, tmp_path, processes):
     assert processes() == [] and os.listdir(scratch) == []
 
 
-WORKER = "import sys, json; from splatvk.batch import run_row; run_row(json.loads(sys.argv[1]), sys.argv[2], scratch=sys.argv[3])"
+WORKER = (
+    "import sys, json; from splatvk.batch import run_row\n"
+    "run_row(json.loads(sys.argv[1]), sys.argv[2], scratch=sys.argv[3])"
+)
 THREADED = (
     "import sys, json, threading, time; from splatvk.batch import run_row\n"
-    "threading.Thread(target=run_row, args=(json.loads(sys.argv[1]), sys.argv[2]), kwargs={'scratch': sys.argv[3]}).start()"
+    "row, out, scratch = json.loads(sys.argv[1]), *sys.argv[2:4]\n"
+    "threading.Thread(target=run_row, args=(row, out), kwargs={'scratch': scratch}).start()"
 )
 
 
-KILLED_BEFORE_COMMIT = "import os; from splatvk.batch import _row; _row.commit = lambda *_: os.kill(os.getpid(), 9); " + WORKER
+KILLED_BEFORE_COMMIT = (
+    "import os; from splatvk.batch import _row; _row.commit = lambda *_: os.kill(os.getpid(), 9); " + WORKER
+)
 
 
 def test_kill_before_success_is_mended(row, scratch, tmp_path, processes):
@@ -188,6 +195,7 @@ def test_killed_worker_leaves_nothing(row, scratch, tmp_path, processes, code):
 
 def test_killed_keeper_ends_program(scratch, tmp_path, processes):
     with pytest.raises(KeeperGone), Keeper(str(scratch)) as keeper:
+
         def kill():
             eventually(lambda: len(processes()) == 2)
             os.kill(keeper._process.pid, signal.SIGKILL)
@@ -221,7 +229,8 @@ def test_two_workers_have_one_winner(place, row, scratch):
     row["options"] = {"seconds": 0.5}
     outcomes = []
     workers = [
-        threading.Thread(target=lambda: outcomes.append(run_row(row, place, scratch=str(scratch)))) for _ in range(3)
+        threading.Thread(target=lambda: outcomes.append(run_row(row, place, scratch=str(scratch))))
+        for _ in range(3)
     ]
     for worker in workers:
         worker.start()

@@ -5,7 +5,6 @@ import sys
 from functools import partial
 
 import pytest
-
 from splatvk.batch import run_row
 
 
@@ -27,7 +26,9 @@ def test_dask_maps_rows(rows, tmp_path):
     )
     with cluster, distributed.Client(cluster) as client:
         made = partial(run_row, retries=2)
-        outcomes = client.gather(client.map(made, rows, out=str(out), timeout=60, resources={"GPU": 1}, pure=False))
+        outcomes = client.gather(
+            client.map(made, rows, out=str(out), timeout=60, resources={"GPU": 1}, pure=False)
+        )
     assert [o["state"] for o in outcomes] == ["done"] * 4 + ["failed"]
     assert outcomes[4]["kind"] == "refused"
     assert stored(out) == [f"row-{n}" for n in range(4)]
@@ -43,12 +44,13 @@ def test_spark_maps_rows(rows, tmp_path, monkeypatch):
 
     def make(frames):
         import pandas
-
         from splatvk.batch import run_row
 
         for frame in frames:
             outcomes = [run_row(json.loads(row), out, retries=2) for row in frame["row"]]
-            yield pandas.DataFrame({"id": [o["id"] for o in outcomes], "state": [o["state"] for o in outcomes]})
+            yield pandas.DataFrame(
+                {"id": [o["id"] for o in outcomes], "state": [o["state"] for o in outcomes]}
+            )
 
     spark = sql.SparkSession.builder.master("local[2]").config("spark.ui.enabled", "false").getOrCreate()
     try:
@@ -56,5 +58,7 @@ def test_spark_maps_rows(rows, tmp_path, monkeypatch):
         found = frame.repartition(3).mapInPandas(make, "id string, state string").collect()
     finally:
         spark.stop()
-    assert sorted((r.id, r.state) for r in found) == [("bad", "failed")] + [(f"row-{n}", "done") for n in range(4)]
+    assert sorted((r.id, r.state) for r in found) == [("bad", "failed")] + [
+        (f"row-{n}", "done") for n in range(4)
+    ]
     assert stored(tmp_path / "out") == [f"row-{n}" for n in range(4)]

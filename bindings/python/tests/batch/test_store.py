@@ -31,14 +31,16 @@ def test_one_of_many_writers_wins(place):
     store, wins = open_store(place), []
     for version in ("new", "old"):
         tag = ABSENT if version == "new" else store.version("a/x.json")
-        puts = [
-            threading.Thread(target=lambda n=n: wins.append(store.put_if("a/x.json", str(n).encode() * 9, tag)))
-            for n in range(8)
-        ]
-        for put in puts:
-            put.start()
-        for put in puts:
-            put.join()
+
+        def put(number, tag=tag, version=version):
+            # Equal contents have equal versions: no writer puts what was there before.
+            wins.append(store.put_if("a/x.json", f"{version} {number}".encode(), tag))
+
+        puts = [threading.Thread(target=put, args=(n,)) for n in range(8)]
+        for thread in puts:
+            thread.start()
+        for thread in puts:
+            thread.join()
         assert wins.count(True) == 1, version
         wins.clear()
     assert store.names("a") == ["x.json"]

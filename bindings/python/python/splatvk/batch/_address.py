@@ -90,7 +90,12 @@ def _remote(entry: str) -> list[Found]:
     if len(files) == 1 and files[0]["name"] == path:
         root = path.rpartition("/")[0]
     return [
-        Found(f"{protocol}://{i['name'].lstrip('/')}", i["size"] or 0, _tag(i), i["name"][len(root) :].lstrip("/"))
+        Found(
+            f"{protocol}://{i['name'].lstrip('/')}",
+            i["size"] or 0,
+            _tag(i),
+            i["name"][len(root) :].lstrip("/"),
+        )
         for i in files
     ]
 

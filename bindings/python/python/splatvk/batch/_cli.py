@@ -24,17 +24,28 @@ def _parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     add = parser.add_argument
-    add("manifest", help="JSON lines {id, input, options, queries, exports}, CSV id,input, or a folder of folders")
+    add(
+        "manifest",
+        help="JSON lines {id, input, options, queries, exports}, CSV id,input, or a folder of folders",
+    )
     add("--out", required=True, metavar="ADDRESS", help="folder, or address of fsspec: s3://bucket/scenes")
     add("--engine", choices=["ray"], default="ray", help=argparse.SUPPRESS)
-    where = "Ray cluster; `local` starts one here [default: RAY_ADDRESS, else the one that runs here, else local]"
+    where = (
+        "Ray cluster; `local` starts one here [default: RAY_ADDRESS, else the one that runs here, else local]"
+    )
     add("--address", help=where)
     gpus = "may be a fraction [default: 1 where the cluster has GPUs, else 0]"
     add("--gpus-per-row", type=float, metavar="N", help=gpus)
     cpus = "[default: the share of a GPU; without GPUs 4, or what the smallest node has]"
     add("--cpus-per-row", type=float, metavar="N", help=cpus)
     add("--timeout", type=_seconds, metavar="TIME", help="longest time of a row, with s, m or h")
-    add("--retries", type=int, default=2, metavar="N", help="more tries of a row whose machine failed [default: 2]")
+    add(
+        "--retries",
+        type=int,
+        default=2,
+        metavar="N",
+        help="more tries of a row whose machine failed [default: 2]",
+    )
     add("--max-failures", metavar="N|P%", help="start no more rows once more have failed")
     add("--only", choices=["failed"], help="rows whose last attempt failed, refused ones included")
     shard = "every N-th row from I on; auto in an array job, auto/N on Kubernetes"
@@ -123,7 +134,12 @@ def _run(arguments: argparse.Namespace, manifest: Manifest, store: Store, shard:
 
 
 def _drive(
-    arguments: argparse.Namespace, store: Store, looker: Looker, total: int, limit: float | None, shard: tuple[int, int]
+    arguments: argparse.Namespace,
+    store: Store,
+    looker: Looker,
+    total: int,
+    limit: float | None,
+    shard: tuple[int, int],
 ) -> int:
     try:
         from ._ray import Engine, Options
@@ -152,7 +168,9 @@ def _drive(
         with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
             engine.connect()
             engine.run()
-        code = 3 if engine.missing else 1 if engine.counts.failed + engine.counts.known or engine.stopped else 0
+        code = (
+            3 if engine.missing else 1 if engine.counts.failed + engine.counts.known or engine.stopped else 0
+        )
     except KeyboardInterrupt:
         code = 130
         engine.cancel()

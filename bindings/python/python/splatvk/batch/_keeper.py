@@ -22,7 +22,8 @@ from collections.abc import Iterator
 from typing import Any
 
 PR_SET_PDEATHSIG = 1
-#: Locked by a file that the keeper inherits and keeps open; its programs do not. A folder whose lock is free is a leftover.
+#: The keeper inherits the open file and so holds its lock; its programs do not. A folder whose lock is
+#: free is a leftover.
 LOCK = ".lock"
 
 

@@ -78,7 +78,12 @@ class Looker:
         try:
             source = source_of(row, __version__)
         except InputError as error:
-            refused = {"id": name, "state": "failed", "attempts": 0, **Failure("refused", str(error), 2).record()}
+            refused = {
+                "id": name,
+                "state": "failed",
+                "attempts": 0,
+                **Failure("refused", str(error), 2).record(),
+            }
             return Look(row, refused, None, 0, 0, swept)
         files = source["files"]
         found = read_success(store, name) if SUCCESS in entries else None

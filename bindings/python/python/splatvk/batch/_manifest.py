@@ -48,7 +48,8 @@ def row_of(raw: object, where: str = "row", base: str = "") -> Row:
     name = raw.get("id")
     if not isinstance(name, str) or not ID.fullmatch(name):
         raise InputError(
-            f"{where}: id {json.dumps(name)} must be 1 to 100 of A-Z a-z 0-9 . _ - and begin with a letter or digit"
+            f"{where}: id {json.dumps(name)} must be 1 to 100 of A-Z a-z 0-9 . _ - "
+            "and begin with a letter or digit"
         )
     inputs = _texts(raw.get("input", ()), "input", where)
     if not inputs:

@@ -141,5 +141,7 @@ class Keeper:
         except BrokenPipeError:
             raise KeeperGone from None
         answer = self._answer()
-        out, log = (Path(paths[name]).read_text(encoding="utf-8", errors="replace") for name in ("stdout", "stderr"))
+        out, log = (
+            Path(paths[name]).read_text(encoding="utf-8", errors="replace") for name in ("stdout", "stderr")
+        )
         return Ended(int(str(answer["exit_code"])), bool(answer["timed_out"]), out, log)

@@ -244,7 +244,9 @@ class Engine:
             self._excluded.add(node)
             self._reason = outcome["message"]
             text = f"node {outcome.get('host', node)} gets no more rows: {outcome['message']}"
-            self._events.write("excluded", text, node=node, host=outcome.get("host"), message=outcome["message"])
+            self._events.write(
+                "excluded", text, node=node, host=outcome.get("host"), message=outcome["message"]
+            )
             if all(n["NodeID"] in self._excluded for n in _nodes()):
                 self.missing = True
                 self._stop(f"no node is left that can work: {self._reason}")
@@ -270,7 +272,11 @@ class Engine:
             # A lost worker may have finished, and so may another driver.
             found = read_success(self._store, name)
             if found and found.get("source") == outcome.get("source"):
-                outcome = {"id": name, "attempts": outcome["attempts"], **finished(self._store, name, found, "skipped")}
+                outcome = {
+                    "id": name,
+                    "attempts": outcome["attempts"],
+                    **finished(self._store, name, found, "skipped"),
+                }
             else:
                 write_failure(self._store, outcome)
         self._summary.add(outcome)

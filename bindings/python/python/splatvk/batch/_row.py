@@ -264,7 +264,10 @@ def _success_of(result: Path) -> dict[str, Any]:
 
 def finished(store: Store, name: str, success: dict[str, Any], state: str) -> Outcome:
     place = "" if success.get("at", ".") == "." else f"/{success['at']}"
-    shown = {key: success.get(key) for key in ("seconds", "photos", "psnr", "rotation_sigma_degrees", "splats", "key")}
+    shown = {
+        key: success.get(key)
+        for key in ("seconds", "photos", "psnr", "rotation_sigma_degrees", "splats", "key")
+    }
     device = success.get("device")
     shown["device"] = device.get("name") if isinstance(device, dict) else device
     shown["answers_found"] = sum(a.get("found") is True for a in success.get("answers") or ())
