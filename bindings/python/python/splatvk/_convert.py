@@ -30,21 +30,24 @@ def to_rerun(scene, path):
     import rerun as rr
 
     colours = np.clip(0.5 + _SH_C0 * scene.sh[:, 0], 0, 1)
+    rgba = np.concatenate([colours, scene.opacities[:, None]], axis=1)
     if scene.up is not None:
         # The data stay in scene axes; this turns the first view of Rerun.
         axis = int(np.argmax(np.abs(scene.up)))
         name = f"RIGHT_HAND_{'XYZ'[axis]}_{'UP' if scene.up[axis] > 0 else 'DOWN'}"
         rr.log(path, getattr(rr.ViewCoordinates, name), static=True)
     if hasattr(rr, "GaussianSplats3D"):
+        # Rerun takes the 15 coefficients of degrees 1 to 3.
+        rest = np.zeros((len(scene.means), 15, 3), np.float32)
+        rest[:, : scene.sh.shape[1] - 1] = scene.sh[:, 1:]
         splats = rr.GaussianSplats3D(
             centers=scene.means,
             scales=scene.scales,
             quaternions=scene.quats[:, [1, 2, 3, 0]],
-            opacities=scene.opacities,
-            colors=colours,
+            colors=rgba,
+            sh_coefficients=rest if scene.sh_degree > 0 else None,
         )
     else:
-        rgba = np.concatenate([colours, scene.opacities[:, None]], axis=1)
         splats = rr.Points3D(scene.means, colors=rgba, radii=scene.scales.max(axis=1))
     rr.log(f"{path}/splats", splats, static=True)
     for camera in scene.cameras:
