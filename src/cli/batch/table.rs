@@ -91,7 +91,8 @@ fn csv(states: &[RowState<'_>]) -> Result<Vec<u8>> {
     table.into_inner().map_err(|e| Error::work(format!("summary.csv: {e}")))
 }
 
-/// Folder of the scene and the exports below that of the batch. A cluster writes them to one of its own.
+/// Folder of the scene and the exports below that of the batch. A cluster writes them to one of its
+/// own.
 fn folder(id: &str, success: &Value) -> String {
     match success["at"].as_str().filter(|at| *at != ".") {
         Some(at) => format!("{id}/{at}"),
