@@ -10,7 +10,7 @@ begin = time.monotonic()
 
 import splatvk  # noqa: E402
 
-answer = splatvk.reconstruct(sys.argv[1], preset="draft", max_size=320).query("yellow lemon")
+answer = splatvk.reconstruct(sys.argv[1], out="two-lines", preset="draft", max_size=320).query("yellow lemon")
 print(f"{answer!r} {time.monotonic() - begin:.0f} s after the start")
 assert answer.presence == "found", answer
 
