@@ -1,16 +1,20 @@
 #version 460
+// variants: SSIM=0,1
 // SSIM, pass 3 of 3: vertical blur of the derivatives, then the gradient of
 //   l1_weight * mean|x-y| + dssim_weight * (1 - mean SSIM)
 // by x; the loss weights are given divided by the number of values. Also the sum of |x-y| per
 // strip. Where pixels have weights w, x is y + w (x-y) in all three passes: a pixel of weight 0
-// does not affect the windows of its neighbours.
+// does not affect the windows of its neighbours. With SSIM=0 the loss is the first term alone, and
+// this is the only pass.
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;
 layout(std430, binding = 0) readonly buffer Rendered { float rendered[]; };  // [C, H, W]
 // [C, H, W], with [H, W] weights behind it where weighted is not 0.
 layout(std430, binding = 1) readonly buffer Target { float target_image[]; };
+#if SSIM
 layout(std430, binding = 2) readonly buffer Slopes { vec2 slopes[]; };  // [C, H, W]
 layout(std430, binding = 3) readonly buffer Cross { float cross_slopes[]; };  // [C, H, W]
+#endif
 // [C, H, W]: the first planes of the upstream stack.
 layout(std430, binding = 4) writeonly buffer Gradient { float gradient[]; };
 // [C, strips, W] sum of |x-y| over each strip.
@@ -25,6 +29,7 @@ void main() {
     int channel = int(gl_WorkGroupID.z);
     int base = channel * width * height;
     if (x >= width) return;
+#if SSIM
     float a[STRIP], b[STRIP], c[STRIP];
     [[unroll]] for (int k = 0; k < STRIP; k++) { a[k] = 0.0; b[k] = 0.0; c[k] = 0.0; }
     [[unroll]] for (int i = 0; i < STRIP + 2 * HALF; i++) {
@@ -42,6 +47,7 @@ void main() {
             }
         }
     }
+#endif
     float sum = 0.0;
     [[unroll]] for (int k = 0; k < STRIP; k++) {
         if (y0 + k < height) {
@@ -50,7 +56,10 @@ void main() {
             float share = weighted != 0 ? target_image[3 * width * height + (q - base)] : 1.0;
             if (weighted != 0) u = fma(share, u - v, v);
             bool counts = y0 + k >= first && y0 + k < end;
-            float slope = l1_weight * sign(u - v) - dssim_weight * (a[k] + 2.0 * u * b[k] + v * c[k]);
+            float slope = l1_weight * sign(u - v);
+#if SSIM
+            slope -= dssim_weight * (a[k] + 2.0 * u * b[k] + v * c[k]);
+#endif
             gradient[q] = counts ? share * slope : 0.0;
             sum += counts ? abs(u - v) : 0.0;
         }

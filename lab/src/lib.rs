@@ -1,5 +1,5 @@
 //! The laboratory of splatvk: the tables of the paper's experiments ([`ablate`]), data with ground
-//! truth ([`generate`]), the published evaluation protocols ([`protocol`]), and their commands
+//! truth ([`generate`]), figures against seconds of training ([`curve`]), the published evaluation protocols ([`protocol`]), and their commands
 //! ([`cli`], program `splatlab`). It is not part of the installed program.
 #![warn(missing_docs)]
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
@@ -7,6 +7,7 @@
 
 pub mod ablate;
 pub mod cli;
+pub mod curve;
 pub mod generate;
 pub mod protocol;
 

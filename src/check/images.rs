@@ -6,7 +6,7 @@ use crate::pass::Rasterizer;
 use crate::pass::bands::Bands;
 use crate::pass::channels::BASE_CHANNELS;
 use crate::pass::close::Tolerance;
-use crate::pass::codes::{self, Mode, Targets};
+use crate::pass::codes::{self, Targets};
 use crate::pass::decode::{Codes, decode_pixels};
 use crate::pass::pack::{self, Encoding, FrameChannel};
 use crate::pass::plane_sweep::{GpuMatcher, Matcher, ReferenceView, SourceView};
@@ -71,7 +71,7 @@ pub(super) fn codes(device: &Device) -> Found {
         Targets { labels: &labelled, codes: &codes, weights: &weights, levels: 1, width: width as u32 };
     let loss = device.buffer::<f32>("loss", PIXELS)?;
     let mut rec = Recorder::new(device, "self-check of the code loss");
-    codes::record(&mut rec, &targets, frame, &loss, Mode::Loss);
+    codes::record(&mut rec, &targets, frame, &loss);
     rec.run()?;
     let features = wide(&planes[BASE_CHANNELS * PIXELS..]);
     let (by_pixel, gradient) = codes::code_l1(&labels, &wide(&table), width, 0.5, &features);

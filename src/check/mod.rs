@@ -71,7 +71,7 @@ const CASES: &[Case] = &[
     case("code loss", None, images::codes),
     case("decoding of codes", None, images::decode),
     case("packing of images", None, images::pack),
-    case("plane sweep stereo", None, images::plane_sweep),
+    case("plane sweep stereo", Some(KernelVariant::DeviceSweep), images::plane_sweep),
 ];
 
 /// Compares all passes and reports each row when it is done; an error of `report` ends the check.

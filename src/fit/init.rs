@@ -1,15 +1,16 @@
-//! Splats from points: size from the pixel footprint and the nearest neighbours, colour from the
-//! photos (docs/internals/method.md#splats-from-points).
+//! Splats from points: size from the pixel footprint and the nearest neighbours, a disc in the
+//! surface where its normal is known, colour from the photos
+//! (docs/internals/method.md#splats-from-points).
 use super::options::InitOptions;
 use crate::math::Random;
 use crate::scene::{PointCloud, SH_C0, Splats};
 use crate::{Error, Result};
-use glam::Vec3;
+use glam::{Quat, Vec3};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::hash::{BuildHasherDefault, Hasher};
 
-/// Makes one isotropic splat per (kept) point, SH degree 0.
+/// Makes one splat per (kept) point, SH degree 0.
 pub fn splats_from_points(points: &PointCloud, options: &InitOptions, seed: u64) -> Result<Splats> {
     let finite: Vec<usize> = (0..points.len())
         .filter(|&i| points.positions[i].iter().chain(&points.colours[i]).all(|v| v.is_finite()))
@@ -35,8 +36,11 @@ pub fn splats_from_points(points: &PointCloud, options: &InitOptions, seed: u64)
         // 1e-7 is the squared-distance floor of the reference implementation for coincident points.
         let scale = footprint.min(spacing[n] * options.neighbours).max(1e-7f32.sqrt());
         splats.means.push(points.positions[i]);
-        splats.log_scales.push([scale.ln(); 3]);
-        splats.quats.push([1.0, 0.0, 0.0, 0.0]);
+        let normal = points.normals.get(i).map_or(Vec3::ZERO, |n| Vec3::from(*n));
+        let thickness = if normal == Vec3::ZERO { 1.0 } else { options.thickness };
+        splats.log_scales.push([scale, scale, thickness * scale].map(f32::ln));
+        let turn = Quat::from_rotation_arc(Vec3::Z, normal.try_normalize().unwrap_or(Vec3::Z));
+        splats.quats.push([turn.w, turn.x, turn.y, turn.z]);
         splats.opacity_logits.push(logit);
         splats.sh.extend(points.colours[i].map(|c| (c - 0.5) / SH_C0));
     }
@@ -254,7 +258,8 @@ mod tests {
     #[test]
     fn new_splats_keep_colour_within_sizes() {
         let points = cloud(200, 5);
-        let options = InitOptions { max_points: 1000, opacity: 0.3, footprint: 0.5, neighbours: 1.0 };
+        let options =
+            InitOptions { max_points: 1000, opacity: 0.3, footprint: 0.5, neighbours: 1.0, thickness: 0.2 };
         let splats = splats_from_points(&points, &options, 0).unwrap();
         let positions: Vec<Vec3> = points.positions.iter().map(|p| Vec3::from(*p)).collect();
         let spacing = neighbour_distances(&positions);
@@ -273,7 +278,8 @@ mod tests {
     fn thinning_limits_count_keeps_sparse_regions() {
         let mut points = cloud(4000, 9);
         points.positions[77] = [50.0, 50.0, 50.0];
-        let options = InitOptions { max_points: 500, opacity: 0.5, footprint: 0.7, neighbours: 1.0 };
+        let options =
+            InitOptions { max_points: 500, opacity: 0.5, footprint: 0.7, neighbours: 1.0, thickness: 0.2 };
         let splats = splats_from_points(&points, &options, 1).unwrap();
         assert_eq!(splats.len(), 500);
         assert!(splats.means.contains(&[50.0, 50.0, 50.0]), "the only point of its region survives");
@@ -285,7 +291,8 @@ mod tests {
         let mut points = cloud(5, 1);
         points.positions[0][1] = f32::NAN;
         points.colours[1][0] = f32::INFINITY;
-        let options = InitOptions { max_points: 10, opacity: 0.5, footprint: 0.7, neighbours: 1.0 };
+        let options =
+            InitOptions { max_points: 10, opacity: 0.5, footprint: 0.7, neighbours: 1.0, thickness: 0.2 };
         assert!(splats_from_points(&points, &options, 0).is_err());
     }
 }

@@ -2,7 +2,7 @@
 //! (docs/internals/method.md#language-training), `L = λ2·L_img + (1−λ2)·L_sem`, from lifted
 //! features.
 use super::half_res::Photos;
-use super::lift::{CodeTargets, Lifting};
+use super::lift::{CodeTargets, code_length, lift};
 use super::losses::Losses;
 use super::model::{Model, not_finite};
 use super::options::{LanguageOptions, Start};
@@ -13,7 +13,7 @@ use super::views::Views;
 use crate::gpu::{self, Buffer, Device, Recorder};
 use crate::pass::channels::BASE_CHANNELS;
 use crate::pass::options::{FeatureMode, RasterOptions};
-use crate::pass::{codes, codes::Mode, regularise, sum};
+use crate::pass::{codes, regularise, sum};
 use crate::progress::Progress;
 use crate::scene::{Camera, LEVEL_NAMES, LanguageField, LevelField, RgbImage, Splats};
 use crate::{Error, Result};
@@ -48,7 +48,7 @@ impl LanguagePoint {
     }
 }
 
-/// Last measured decode accuracy of a level.
+/// Last accuracy of a level that was measured while features were trained.
 pub fn decode_accuracy(curve: &[LanguagePoint], level: usize) -> Option<f64> {
     curve.iter().rev().find_map(|p| *p.accuracy.get(level)?)
 }
@@ -105,24 +105,68 @@ pub(crate) fn train_language_of(
     let mut out = TrainedLanguage { splats: splats.clone(), field, curve: Vec::new(), seconds: 0.0 };
     for (g, group) in groups.iter().enumerate() {
         let levels: Vec<(usize, &LevelField)> = group.iter().map(|&l| (l, &out.field.levels[l])).collect();
-        let mut run = Run::new(device, photos, splats, &levels, options, progress)?;
-        training::train(&mut run, g, options.iterations, progress)?;
-        let (trained, features) = run.finish()?;
-        let before = g * options.iterations;
-        out.curve.extend(run.curve.drain(..).map(|p| LanguagePoint { step: before + p.step, ..p }));
-        let features = features.into_iter().zip(std::mem::take(&mut run.reliability));
+        let fields: Vec<&LevelField> = levels.iter().map(|l| l.1).collect();
+        let made = if options.iterations == 0 && options.start == Start::Lifted {
+            lifted_model(device, photos.cameras, splats, &fields, options.epsilon, progress)?
+        } else {
+            let mut run = Run::new(device, photos, splats, &levels, options, progress)?;
+            training::train(&mut run, g, options.iterations, progress)?;
+            let made = run.finish()?;
+            let before = g * options.iterations;
+            out.curve.extend(run.curve.drain(..).map(|p| LanguagePoint { step: before + p.step, ..p }));
+            made
+        };
+        let features = made.features.into_iter().zip(made.reliability);
         for (&level, (features, reliability)) in group.iter().zip(features) {
             out.field.levels[level].set_features(features);
             out.field.levels[level].reliability = reliability;
         }
         match group.as_slice() {
-            [level] if options.per_level => out.field.levels[*level].splats = Some(trained),
-            _ => out.splats = trained,
+            [level] if options.per_level => out.field.levels[*level].splats = Some(made.splats),
+            _ => out.splats = made.splats,
         }
     }
     progress.end();
     out.seconds = clock.elapsed().as_secs_f64();
     Ok(out)
+}
+
+/// Splats with their features.
+struct FeaturedSplats {
+    splats: Splats,
+    /// Per level, [N, d] as rendered.
+    features: Vec<Vec<f32>>,
+    /// Per level, [N].
+    reliability: Vec<Vec<f32>>,
+}
+
+/// The given splats with lifted features.
+fn lifted_model(
+    device: &Device,
+    cameras: &[Camera],
+    splats: &Splats,
+    levels: &[&LevelField],
+    epsilon: f32,
+    progress: &dyn Progress,
+) -> Result<FeaturedSplats> {
+    let (count, width) = (levels.len(), code_length(levels)?);
+    let lifted = lift(device, cameras, splats, levels, progress)?;
+    Ok(FeaturedSplats {
+        splats: splats.clone(),
+        features: rendered_features(lifted.features(width), count, width, epsilon),
+        reliability: (0..count).map(|l| lifted.reliability(l, count, width)).collect(),
+    })
+}
+
+/// Divides raw features [N, levels·d] by their length plus ε and separates the levels.
+fn rendered_features(mut all: Vec<f32>, levels: usize, d: usize, epsilon: f32) -> Vec<Vec<f32>> {
+    all.par_chunks_exact_mut(d).for_each(|feature| {
+        let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
+        feature.iter_mut().for_each(|v| *v /= norm + epsilon);
+    });
+    let features_of =
+        |l: usize| all.chunks_exact(levels * d).flat_map(move |f| &f[l * d..(l + 1) * d]).copied();
+    (0..levels).into_par_iter().map(|l| features_of(l).collect()).collect()
 }
 
 /// Training of one model, with all levels or one.
@@ -166,23 +210,14 @@ impl<'a> Run<'a> {
         let scale = SceneScale::measure(cameras, &splats.means);
         let model = Model::new(device, splats, channels)?;
         let (capacity, near) = (splats.len(), scale.near());
-        let mut views = Views::new(device, photos, (&options.losses, 0.0), capacity, channels, near)?;
+        let views = Views::new(device, photos, (&options.losses, 0.0), capacity, channels, near)?;
         let targets = CodeTargets::new(device, &fields, images, &views, 1.0 - options.image_weight)?;
         let raster = RasterOptions {
             sh_degree: splats.sh_degree,
             feature_mode: FeatureMode::Gauge { epsilon: options.epsilon, blocks: levels.len() },
             features_move_geometry: !options.detach_geometry,
         };
-        let mut lifting = Lifting {
-            device,
-            views: &mut views,
-            cameras,
-            model: &model,
-            raster,
-            targets: &targets,
-            progress,
-        };
-        let lifted = lifting.sums()?;
+        let lifted = lift(device, cameras, splats, &fields, progress)?;
         let reliability = (0..levels.len()).map(|l| lifted.reliability(l, levels.len(), width)).collect();
         match options.start {
             Start::Zero => {}
@@ -252,12 +287,11 @@ impl<'a> Run<'a> {
         Ok(self.trainer.model.values.features.write(features)?)
     }
 
-    /// Splats and, per level, features [N, d] as rendered.
-    fn finish(&mut self) -> Result<(Splats, Vec<Vec<f32>>)> {
+    fn finish(&mut self) -> Result<FeaturedSplats> {
         let model = &self.trainer.model;
         let splats = model.splats()?;
         let (levels, d) = (self.levels.len(), self.width);
-        let mut all = model.values.features.read_range(0..splats.len() * levels * d)?;
+        let all = model.values.features.read_range(0..splats.len() * levels * d)?;
         let bad = not_finite(&all);
         if bad > 0 {
             return Err(Error::work(format!(
@@ -265,14 +299,8 @@ impl<'a> Run<'a> {
                 all.len()
             )));
         }
-        let epsilon = self.options.epsilon;
-        all.par_chunks_exact_mut(d).for_each(|feature| {
-            let norm = feature.iter().map(|v| v * v).sum::<f32>().sqrt();
-            feature.iter_mut().for_each(|v| *v /= norm + epsilon);
-        });
-        let features_of =
-            |l: usize| all.chunks_exact(levels * d).flat_map(move |f| &f[l * d..(l + 1) * d]).copied();
-        Ok((splats, (0..levels).into_par_iter().map(|l| features_of(l).collect()).collect()))
+        let features = rendered_features(all, levels, d, self.options.epsilon);
+        Ok(FeaturedSplats { splats, features, reliability: std::mem::take(&mut self.reliability) })
     }
 }
 
@@ -321,7 +349,7 @@ impl Training for Run<'_> {
                     regularise::record_alpha(&mut rec, frame, &alpha[band.index], weight);
                 }
             }
-            codes::record(&mut rec, &self.targets.of(view, &band), frame, loss, Mode::Loss);
+            codes::record(&mut rec, &self.targets.of(view, &band), frame, loss);
             sum::record(&mut rec, loss, &self.partials, &stage.sums, stage.slot(&band) + LANGUAGE_SUM);
             stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
         }

@@ -1,13 +1,16 @@
 //! Code targets in GPU memory, and lifting: the blending-weighted mean of the codes of the pixels
 //! of each splat (docs/internals/method.md#lifting).
-use super::model::Model;
+use super::scale::SceneScale;
 use super::views::Views;
-use crate::gpu::{self, Buffer, Device, Recorder};
+use crate::gpu::{self, Buffer, Device};
 use crate::pass::bands::Band;
-use crate::pass::codes::{self, Mode, Targets};
-use crate::pass::options::{FeatureMode, RasterOptions};
+use crate::pass::codes::Targets;
+use crate::pass::label_weights::LabelWeights;
+use crate::pass::options::RasterOptions;
+use crate::pass::rasterizer::{Rasterizer, SplatBuffers};
+use crate::pass::view::View;
 use crate::progress::Progress;
-use crate::scene::{Camera, LevelField, RgbImage};
+use crate::scene::{Camera, LevelField, RgbImage, Splats};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -39,10 +42,7 @@ impl CodeTargets {
         views: &Views,
         weight: f64,
     ) -> Result<Self> {
-        let width = levels[0].codebook.code_dim;
-        if levels.iter().any(|l| l.codebook.code_dim != width) {
-            return Err(Error::work("all levels must have codes of one length to share a model"));
-        }
+        let width = code_length(levels)?;
         let codes: Vec<f32> = levels.iter().flat_map(|l| l.codebook.codes.iter().copied()).collect();
         let (mut labels, mut weights) = (Vec::new(), Vec::new());
         for (view, image) in images.iter().enumerate() {
@@ -80,6 +80,16 @@ impl CodeTargets {
     }
 }
 
+/// Code length of levels that share a model.
+pub(super) fn code_length(levels: &[&LevelField]) -> Result<usize> {
+    let mut lengths = levels.iter().map(|l| l.codebook.code_dim);
+    let first = lengths.next().unwrap_or(0);
+    if lengths.any(|length| length != first) {
+        return Err(Error::work("all levels must have codes of one length to share a model"));
+    }
+    Ok(first)
+}
+
 /// The labels of one level and view as rows of the common code table, whose first row for this
 /// level is `first`.
 fn rows_of(level: &LevelField, view: usize, pixels: usize, first: i32) -> Result<Vec<i32>> {
@@ -104,79 +114,72 @@ pub(super) struct Lifted {
     pub(super) weights: Vec<f32>,
 }
 
-/// Passes over all photos that lift codes onto the splats of the model.
-///
-/// The gradient of `Σ_px F(px)·c(px)` by a splat's feature is `Σ_px w(px) c(px)`, so one backward
-/// pass per view with the codes as upstream gives the weighted sums, and with ones as upstream of a
-/// colour the weights themselves.
-pub(super) struct Lifting<'a> {
-    pub(super) device: &'a Device,
-    pub(super) views: &'a mut Views,
-    pub(super) cameras: &'a [Camera],
-    pub(super) model: &'a Model,
-    pub(super) raster: RasterOptions,
-    pub(super) targets: &'a CodeTargets,
-    /// Checked for cancellation before every pass.
-    pub(super) progress: &'a dyn Progress,
+/// Lifts the codes of all photos onto splats. Nothing but blending weights is rendered.
+pub(super) fn lift(
+    device: &Device,
+    cameras: &[Camera],
+    splats: &Splats,
+    levels: &[&LevelField],
+    progress: &dyn Progress,
+) -> Result<Lifted> {
+    let params = SplatBuffers::upload(device, splats, &[], 0)?;
+    let near = SceneScale::measure(cameras, &splats.means).near();
+    // Colours are not rendered.
+    let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
+    let mut rasterizers: Vec<Rasterizer> = Vec::new();
+    let mut weights = LabelWeights::new(splats.len());
+    for (view, camera) in cameras.iter().enumerate() {
+        progress.check()?;
+        let (width, height) = (camera.width, camera.height);
+        let known = rasterizers.iter().position(|r| [r.frame().width, r.frame().height] == [width, height]);
+        let index = known.unwrap_or(rasterizers.len());
+        if index == rasterizers.len() {
+            rasterizers.push(Rasterizer::new(device, splats.len(), 0, width, height)?);
+        }
+        let raster = &mut rasterizers[index];
+        raster.set_view(&View::new(camera, near))?;
+        let labels = labels_of_view(levels, view, (width * height) as usize)?;
+        raster.add_label_weights(&params, &options, &labels, &mut weights)?;
+    }
+    Ok(Lifted::new(&weights, splats.len(), levels))
 }
 
-impl Lifting<'_> {
-    /// Computes the sums and weights of all photos.
-    pub(super) fn sums(&mut self) -> Result<Lifted> {
-        let (splats, levels) = (self.model.count(), self.targets.levels as usize);
-        let mut lifted = Lifted {
-            sums: vec![0.0; splats * levels * self.targets.width as usize],
-            weights: vec![0.0; splats * levels],
-        };
-        for view in 0..self.cameras.len() {
-            self.add_gradients(view, Mode::Lift, &mut lifted.sums)?;
-            let frame = self.views.stage(view).raster.frame();
-            for (row, by_level) in
-                lifted.weights.chunks_exact_mut(levels).zip(frame.colour_gradients(splats)?)
-            {
-                row.iter_mut().zip(by_level).for_each(|(sum, w)| *sum += w);
-            }
-            // Cleared, because a loss without colours would leave these values.
-            let colours = 3 * frame.bands.pixels();
-            frame.planes_grad.write_at(0, &vec![0f32; colours])?;
-        }
-        Ok(lifted)
+/// [levels, H·W] labels of a view as rows of the common code table; −1 = none.
+fn labels_of_view(levels: &[&LevelField], view: usize, pixels: usize) -> Result<Vec<i32>> {
+    let (mut rows, mut first) = (Vec::with_capacity(levels.len() * pixels), 0);
+    for level in levels {
+        rows.extend(rows_of(level, view, pixels, first)?);
+        first += level.codebook.len() as i32;
     }
-
-    /// Adds the gradients by the features of one view to `sums`.
-    pub(super) fn add_gradients(&mut self, view: usize, mode: Mode, sums: &mut [f32]) -> Result<()> {
-        self.progress.check()?;
-        self.views.set_camera(view, &self.cameras[view])?;
-        // The sums are gradients by the rendered features.
-        let raster = &RasterOptions { feature_mode: FeatureMode::Linear, ..self.raster };
-        let (model, targets) = (self.model, self.targets);
-        let stage = self.views.stage_mut(view);
-        let scratch = self.device.buffer::<f32>("language loss", stage.raster.frame().bands.pixels())?;
-        loop {
-            let frame = stage.raster.frame();
-            let mut rec = Recorder::new(self.device, "lift");
-            stage.raster.record_projection(&mut rec, &model.values, raster);
-            for band in frame.bands.iter() {
-                stage.raster.record_band(&mut rec, &model.values, &band);
-                codes::record(&mut rec, &targets.of(view, &band), frame, &scratch, mode);
-                stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
-            }
-            let gradients = &model.feature_gradients;
-            stage.raster.record_feature_gradients(&mut rec, &model.values, raster, gradients);
-            rec.download(&frame.status);
-            rec.run()?;
-            match stage.raster.overflow()? {
-                Some(needed) => stage.raster.grow(needed)?,
-                None => break,
-            }
-        }
-        let seen = model.feature_gradients.read_range(0..sums.len())?;
-        sums.par_iter_mut().zip(seen).for_each(|(s, v)| *s += v);
-        Ok(())
-    }
+    Ok(rows)
 }
 
 impl Lifted {
+    /// Sums of the codes of labels, which are rows of the common code table.
+    fn new(weights: &LabelWeights, splats: usize, levels: &[&LevelField]) -> Lifted {
+        let width = levels[0].codebook.code_dim;
+        let rows: Vec<(usize, &[f32])> = levels
+            .iter()
+            .enumerate()
+            .flat_map(|(l, level)| level.codebook.codes.chunks_exact(width).map(move |code| (l, code)))
+            .collect();
+        let mut lifted = Lifted {
+            sums: vec![0.0; splats * levels.len() * width],
+            weights: vec![0.0; splats * levels.len()],
+        };
+        let of_splats = lifted.sums.par_chunks_exact_mut(levels.len() * width);
+        let of_splats = of_splats.zip(lifted.weights.par_chunks_exact_mut(levels.len()));
+        of_splats.enumerate().for_each(|(splat, (sums, total))| {
+            for &(label, weight) in weights.of(splat) {
+                let (level, code) = rows[label as usize];
+                total[level] += weight;
+                let sums = &mut sums[level * width..(level + 1) * width];
+                sums.iter_mut().zip(code).for_each(|(sum, c)| *sum += weight * c);
+            }
+        });
+        lifted
+    }
+
     /// Raw start features [N, levels·d], in the directions of the sums.
     pub(super) fn features(&self, width: usize) -> Vec<f32> {
         let mut features = self.sums.clone();

@@ -32,7 +32,7 @@ impl Losses {
 
     /// The photos' part of the objective.
     pub(super) fn photos(&self, loss: &ImageLoss) -> f64 {
-        loss.total(self.l1, self.dssim)
+        if self.dssim > 0.0 { loss.total(self.l1, self.dssim) } else { self.l1 * loss.l1 }
     }
 
     /// Warped photos: their edges are less sharp than those of photos, and their depth is the

@@ -16,6 +16,9 @@ pub struct InitOptions {
     /// Upper bound of the standard deviation in units of the mean distance to the three nearest
     /// points.
     pub neighbours: f32,
+    /// Standard deviation of a new splat along the normal of its surface, where that is known, over
+    /// the one in the surface.
+    pub thickness: f32,
 }
 
 /// Learning rates per parameter class.
@@ -36,6 +39,18 @@ pub struct Rates {
 }
 
 impl Rates {
+    /// These rates times a factor, but for that of the means.
+    pub(super) fn scaled(&self, factor: f64) -> Rates {
+        Rates {
+            means: self.means,
+            log_scales: factor * self.log_scales,
+            quats: factor * self.quats,
+            opacity: factor * self.opacity,
+            sh_dc: factor * self.sh_dc,
+            sh_rest: factor * self.sh_rest,
+        }
+    }
+
     /// Rates of zero.
     pub const STILL: Rates = Rates {
         means: Exponential { start: 0.0, end: 0.0, steps: 1 },
@@ -67,12 +82,16 @@ pub struct RgbOptions {
     pub rates: Rates,
     /// Share of the steps, from the first on, with the photos at half their resolution.
     pub half_res: f64,
+    /// Share of the steps, from the first on, without the SSIM term.
+    pub without_ssim: f64,
+    /// Factor on the learning rates of the last step, other than that of the means, which has its
+    /// own schedule; log-linear from 1.
+    pub decay: f64,
     /// Blending weight, pixels, below which the colour of a splat hardly moves.
     pub colour_pixels: f64,
     /// Terms of the objective.
     pub losses: Losses,
-    /// Number of virtual views, photos warped by their depth, in a run that starts at half
-    /// resolution.
+    /// Number of virtual views, photos warped by their depth at half their resolution.
     pub virtual_views: usize,
     /// Least confidence of stereo depth that is used.
     pub min_confidence: f32,
@@ -132,7 +151,7 @@ impl RgbOptions {
         // There are a few more of the other steps, because new splats are untrained. With many
         // photos, each is used as often as in a run with sixteen.
         let steps = self.iterations.div_ceil(2).max(self.iterations * (known + new) / 16);
-        let mut options = RgbOptions { half_res: 0.0, ..self.with_iterations(steps) };
+        let mut options = RgbOptions { half_res: 0.0, virtual_views: 0, ..self.with_iterations(steps) };
         options.init.max_points = (options.init.max_points * new).div_ceil((known + new).max(1));
         options
     }
@@ -158,7 +177,13 @@ impl RgbOptions {
             iterations,
             // Stereo points are dense and have the right colour, so splats start nearly opaque:
             // from an opacity of 0.1, the first hundred steps would only raise it.
-            init: InitOptions { max_points: 200_000, opacity: 0.6, footprint: 0.7, neighbours: 1.0 },
+            init: InitOptions {
+                max_points: 200_000,
+                opacity: 0.6,
+                footprint: 0.7,
+                neighbours: 1.0,
+                thickness: 1.0,
+            },
             // No photo covers up to 14 % of the pixels of held-out breakfast views; all are within
             // this reach.
             margin: 0.3,
@@ -192,6 +217,7 @@ impl RgbOptions {
                 opacity: 0.1,
                 footprint: f32::INFINITY,
                 neighbours: 1.0,
+                thickness: 1.0,
             },
             margin: 0.0,
             rates: Rates {
@@ -203,6 +229,8 @@ impl RgbOptions {
                 sh_rest: 2.5e-3 / 20.0,
             },
             half_res: 0.0,
+            without_ssim: 0.0,
+            decay: 1.0,
             colour_pixels: 0.0,
             losses: Losses::PHOTOS,
             virtual_views: 0,

@@ -15,9 +15,9 @@ use super::unseen::{backdrop, continued_surfaces};
 use super::views::Views;
 use super::virtual_views::virtual_views;
 use crate::gpu::{Device, Recorder};
+use crate::pass::compact;
 use crate::pass::metrics::psnr_masked;
 use crate::pass::options::{FeatureMode, RasterOptions};
-use crate::pass::{compact, ssim_l1::ImageLoss};
 use crate::progress::Progress;
 use crate::scene::{Camera, Coverage, DepthMap, Outside, PointCloud, RgbImage, Splats};
 use crate::{Error, Result};
@@ -38,8 +38,8 @@ pub struct CurvePoint {
     pub step: usize,
     /// Mean loss over the steps since the last point.
     pub loss: f64,
-    /// Mean SSIM over the same steps.
-    pub ssim: f64,
+    /// Mean SSIM over those of these steps whose objective has it.
+    pub ssim: Option<f64>,
     /// Mean over the views of their last measured PSNR, dB. Each point measures one view, which
     /// costs a copy of its render; views without a measurement are not in the mean.
     pub psnr: f64,
@@ -219,11 +219,13 @@ pub(crate) struct Run<'a> {
     bounds: Option<Bounds>,
     /// Photos of the first steps.
     half_res: Option<OwnedPhotos>,
+    /// Whether the present steps leave out the SSIM term.
+    without_ssim: bool,
     /// Views that follow the photos.
     virtual_views: OwnedPhotos,
     poses: Vec<PoseAdam>,
     /// Losses since the last report.
-    recent: Vec<ImageLoss>,
+    recent: Vec<StepLoss>,
     /// The photo of the last step on one, and whether a step on a virtual view followed.
     last: (usize, bool),
     /// Last measured PSNR per view, dB.
@@ -231,11 +233,18 @@ pub(crate) struct Run<'a> {
     curve: Vec<CurvePoint>,
 }
 
+/// Objective of a step on a photo, and its SSIM if the objective has it.
+#[derive(Clone, Copy, Serialize, Deserialize)]
+struct StepLoss {
+    total: f64,
+    ssim: Option<f64>,
+}
+
 /// State of the stage besides the model, for checkpoints.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct StageState {
     poses: Vec<PoseAdam>,
-    recent: Vec<ImageLoss>,
+    recent: Vec<StepLoss>,
     last: (usize, bool),
     psnr: Vec<Option<f64>>,
     curve: Vec<CurvePoint>,
@@ -258,13 +267,21 @@ impl<'a> Run<'a> {
         };
         let losses = (&options.losses, options.min_confidence);
         let mut views = Views::new(device, first, losses, start.len(), 0, scale.near())?;
-        let virtual_views = match &half_res {
-            Some(half) if !photos.show_emptiness() => {
+        let virtual_views =
+            if options.virtual_views > 0 && photos.depths.is_some() && !photos.show_emptiness() {
                 let (count, confidence) = (options.virtual_views, options.min_confidence);
+                let halved;
+                let half = match &half_res {
+                    Some(half) => half,
+                    None => {
+                        halved = OwnedPhotos::at_half_res(&photos);
+                        &halved
+                    }
+                };
                 virtual_views(&half.photos(), count, confidence, options.seed)
-            }
-            _ => OwnedPhotos::default(),
-        };
+            } else {
+                OwnedPhotos::default()
+            };
         if !virtual_views.images.is_empty() {
             let losses = (&Losses::VIRTUAL, options.min_confidence);
             views.add(device, virtual_views.photos(), losses, start.len(), 0)?;
@@ -280,6 +297,7 @@ impl<'a> Run<'a> {
             photos,
             bounds: options.bounded.then(|| Bounds::new(photos.cameras, &start.means)),
             half_res,
+            without_ssim: options.without_ssim > 0.0,
             virtual_views,
             poses: vec![PoseAdam::default(); photos.cameras.len()],
             recent: Vec::new(),
@@ -310,8 +328,12 @@ impl<'a> Run<'a> {
     }
 
     /// The terms of the objective for a view.
-    fn losses(&self, view: usize) -> &Losses {
-        if view < self.photos.cameras.len() { &self.options.losses } else { &Losses::VIRTUAL }
+    fn losses(&self, view: usize) -> Losses {
+        if view >= self.photos.cameras.len() {
+            return Losses::VIRTUAL;
+        }
+        let all = self.options.losses;
+        Losses { dssim: if self.without_ssim { 0.0 } else { all.dssim }, ..all }
     }
 
     /// Refines a pose; camera 0 stays, because it defines the world frame.
@@ -341,12 +363,13 @@ impl<'a> Run<'a> {
         let photos = self.half_res.as_ref().map_or(self.photos, OwnedPhotos::photos);
         self.psnr[photo] = Some(photos.psnr(photo, &rendered));
         let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
-        let n = self.recent.len().max(1) as f64;
-        let total = |l: &ImageLoss| self.options.losses.photos(l);
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
+        let losses: Vec<f64> = self.recent.iter().map(|l| l.total).collect();
+        let ssim: Vec<f64> = self.recent.iter().filter_map(|l| l.ssim).collect();
         let point = CurvePoint {
             step,
-            loss: self.recent.iter().map(total).sum::<f64>() / n,
-            ssim: self.recent.iter().map(|l| l.ssim).sum::<f64>() / n,
+            loss: mean(&losses),
+            ssim: (!ssim.is_empty()).then(|| mean(&ssim)),
             psnr: known.iter().sum::<f64>() / known.len().max(1) as f64,
             splats: t.model.count(),
         };
@@ -428,9 +451,15 @@ impl Training for Run<'_> {
         if iteration >= half_res_steps(self.options) {
             self.leave_half_res()?;
         }
+        let share = iteration as f64 / self.options.iterations.max(1) as f64;
+        if self.without_ssim && share >= self.options.without_ssim {
+            self.without_ssim = false;
+            self.trainer.forget_recordings();
+        }
         let size = self.photos.images.first().map_or(1, |i| i.data.len());
         self.trainer.model.hold_colours_below(self.options.colour_pixels, size);
-        self.trainer.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)
+        let rates = self.options.rates.scaled(self.options.decay.powf(share));
+        self.trainer.model.set_rates(&rates, 0.0, self.scale.extent, iteration)
     }
 
     fn record(&self, view: usize) -> Recorder {
@@ -462,7 +491,10 @@ impl Training for Run<'_> {
         self.last = (view, false);
         let stage = self.trainer.views.stage(view);
         let [l1, ssim, ..] = stage.total()?;
-        self.recent.push(stage.loss.loss([l1, ssim], self.trainer.views.list[view].covered));
+        let loss = stage.loss.loss([l1, ssim], self.trainer.views.list[view].covered);
+        let losses = self.losses(view);
+        let has_ssim = losses.dssim > 0.0;
+        self.recent.push(StepLoss { total: losses.photos(&loss), ssim: has_ssim.then_some(loss.ssim) });
         self.move_camera(view, iteration)
     }
 
@@ -474,7 +506,8 @@ impl Training for Run<'_> {
         if is_due && !self.recent.is_empty() {
             let CurvePoint { loss, ssim, psnr, splats, .. } = self.measure(step)?;
             report.note = Some(format!("loss {loss:.4}, PSNR {psnr:.1}, {splats} splats"));
-            report.figures = vec![("loss", loss), ("ssim", ssim), ("psnr", psnr), ("splats", splats as f64)];
+            report.figures = vec![("loss", loss), ("psnr", psnr), ("splats", splats as f64)];
+            report.figures.extend(ssim.map(|ssim| ("ssim", ssim)));
         }
         self.prune(step)?;
         Ok(report)

@@ -116,6 +116,7 @@ impl Fit<'_> {
             seed: self.options.seed,
             rates: Rates { sh_dc: self.options.rates[0], sh_rest: self.options.rates[1], ..Rates::STILL },
             half_res: 0.0,
+            virtual_views: 0,
             losses: Losses::PHOTOS,
             bounded: false,
             prune_every: 0,

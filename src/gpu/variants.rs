@@ -38,11 +38,15 @@ pub enum KernelVariant {
     SeparateUpdate,
     /// Both in one pass ([`crate::pass::UpdateKernel::Fused`]).
     FusedUpdate,
+    /// Plane sweep of stereo by the processor ([`crate::pass::plane_sweep_cpu`]).
+    HostSweep,
+    /// Plane sweep of stereo by shaders ([`crate::pass::plane_sweep`]).
+    DeviceSweep,
 }
 
 impl KernelVariant {
     /// All of them.
-    pub const ALL: [KernelVariant; 15] = [
+    pub const ALL: [KernelVariant; 17] = [
         KernelVariant::FloatAtomics,
         KernelVariant::AtomicGradients,
         KernelVariant::StoredGradients,
@@ -58,6 +62,8 @@ impl KernelVariant {
         KernelVariant::ShShared,
         KernelVariant::SeparateUpdate,
         KernelVariant::FusedUpdate,
+        KernelVariant::HostSweep,
+        KernelVariant::DeviceSweep,
     ];
 
     /// The name that `splatvk doctor` prints and [`crate::gpu::Options::disabled`] takes.
@@ -78,6 +84,8 @@ impl KernelVariant {
             KernelVariant::ShShared => "SH gradients in shared memory",
             KernelVariant::SeparateUpdate => "update in two passes",
             KernelVariant::FusedUpdate => "update in one pass",
+            KernelVariant::HostSweep => "plane sweep on the host",
+            KernelVariant::DeviceSweep => "plane sweep on the device",
         }
     }
 
@@ -99,6 +107,8 @@ impl KernelVariant {
             KernelVariant::ShShared => KernelVariant::ShPerThread,
             KernelVariant::SeparateUpdate => KernelVariant::FusedUpdate,
             KernelVariant::FusedUpdate => KernelVariant::SeparateUpdate,
+            KernelVariant::HostSweep => KernelVariant::DeviceSweep,
+            KernelVariant::DeviceSweep => KernelVariant::HostSweep,
         }
     }
 

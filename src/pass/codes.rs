@@ -1,6 +1,5 @@
 //! Language loss: L1 between rendered features and the code of each labelled pixel
-//! (docs/internals/method.md#language-loss), and the upstream gradient that lifts codes onto splats
-//! (docs/internals/method.md#lifting).
+//! (docs/internals/method.md#language-loss).
 use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 
@@ -18,25 +17,12 @@ pub struct Targets<'a> {
     pub width: u32,
 }
 
-/// Values of the feature planes of the upstream stack.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Mode {
-    /// Gradient of the loss.
-    Loss,
-    /// The code, whose back-propagation gives `Σ w·c` per splat; and 1 for colour number `level` of
-    /// labelled pixels, which gives `Σ w` ([`FrameBuffers::colour_gradients`]). Leaves these values
-    /// in the colour planes of the upstream stack.
-    Lift,
-    /// `F − c`, the gradient of half the square: least squares.
-    Residual,
-}
-
 /// Records the loss of the band in the planes of a frame: writes the feature planes of
 /// `frame.planes_grad` and the loss per pixel, `loss` [H·W].
-pub fn record(rec: &mut Recorder, targets: &Targets, frame: &FrameBuffers, loss: &Buffer<f32>, mode: Mode) {
+pub fn record(rec: &mut Recorder, targets: &Targets, frame: &FrameBuffers, loss: &Buffer<f32>) {
     rec.pass("feature loss");
     let pixels = frame.pixels();
-    record_planes(rec, targets, &frame.planes, &frame.planes_grad, loss, pixels, mode);
+    record_planes(rec, targets, &frame.planes, &frame.planes_grad, loss, pixels);
 }
 
 fn record_planes(
@@ -46,7 +32,6 @@ fn record_planes(
     upstream: &Buffer<f32>,
     loss: &Buffer<f32>,
     pixels: u32,
-    mode: Mode,
 ) {
     let call = shaders::code_l1::call(
         &shaders::code_l1::Bindings {
@@ -57,7 +42,7 @@ fn record_planes(
             upstream,
             loss,
         },
-        &shaders::code_l1::Push { pixels, levels: targets.levels, width: targets.width, mode: mode as u32 },
+        &shaders::code_l1::Push { pixels, levels: targets.levels, width: targets.width },
     );
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
@@ -114,16 +99,16 @@ mod tests {
             levels: levels as u32,
             width: width as u32,
         };
-        let run = |planes: &[f32], mode: Mode| {
+        let run = |planes: &[f32]| {
             let planes = device.buffer_from("planes", planes).unwrap();
             let upstream = device.buffer::<f32>("upstream", (5 + levels * width) * pixels).unwrap();
             let loss = device.buffer::<f32>("loss", pixels).unwrap();
             let mut rec = Recorder::new(&device, "codes");
-            record_planes(&mut rec, &targets, &planes, &upstream, &loss, pixels as u32, mode);
+            record_planes(&mut rec, &targets, &planes, &upstream, &loss, pixels as u32);
             rec.run().unwrap();
             (upstream.read().unwrap(), loss.read().unwrap())
         };
-        let (upstream, loss) = run(&planes, Mode::Loss);
+        let (upstream, loss) = run(&planes);
         let wide = |v: &[f32]| v.iter().map(|&a| f64::from(a)).collect::<Vec<_>>();
         let mut expected = vec![0.0; pixels];
         for level in 0..levels {
@@ -145,23 +130,6 @@ mod tests {
                 (0..width).for_each(|k| planes[(4 + level * width + k) * pixels + p] = 1e6);
             }
         }
-        assert_eq!(run(&planes, Mode::Loss), (upstream, loss));
-        let (lifted, _) = run(&planes, Mode::Lift);
-        for p in 0..pixels {
-            let label = labels[p];
-            let code = |k: usize| if label < 0 { 0.0 } else { table[label as usize * width + k] };
-            assert!((0..width).all(|k| lifted[(4 + k) * pixels + p] == code(k)));
-            for level in 0..levels {
-                let labelled = labels[level * pixels + p] >= 0;
-                assert_eq!(lifted[level * pixels + p], f32::from(u8::from(labelled)));
-            }
-        }
-        let (residual, _) = run(&planes, Mode::Residual);
-        for p in 0..pixels {
-            let code = |k: usize| table[labels[p] as usize * width + k];
-            let index = |k: usize| (4 + k) * pixels + p;
-            let expected = |k: usize| if labels[p] < 0 { 0.0 } else { planes[index(k)] - code(k) };
-            assert!((0..width).all(|k| residual[index(k)] == expected(k)));
-        }
+        assert_eq!(run(&planes), (upstream, loss));
     }
 }

@@ -9,6 +9,7 @@ pub mod compact;
 pub mod decode;
 pub mod frame;
 pub mod fused_update;
+pub mod label_weights;
 pub mod metrics;
 pub mod options;
 pub mod pack;

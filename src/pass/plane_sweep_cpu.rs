@@ -1,5 +1,5 @@
-//! CPU reference of the `plane_sweep` and `plane_sweep_refine` shaders: slanted-plane multi-view
-//! matching.
+//! The `plane_sweep` and `plane_sweep_refine` shaders on the host: slanted-plane multi-view matching.
+//! It is the reference of the shaders, and faster than they are where the device is the processor.
 //!
 //! A hypothesis is the plane `π·X = 1` in the reference camera's frame, so that the inverse depth
 //! along a pixel's ray is `1/z = π·ray` and the warp into a source view is the homography `K_s (R +
@@ -23,6 +23,14 @@ const SIGMA_SPACE: f32 = shared::SIGMA_SPACE as f32;
 const SMOOTH_LIMIT: f32 = shared::SMOOTH_LIMIT as f32;
 const GEOMETRIC_LIMIT: f32 = shared::GEOMETRIC_LIMIT as f32;
 
+/// Taps of a window besides the middle one.
+const OUTER: usize = TAPS * TAPS - 1;
+/// Numbers that a loop over the taps handles together.
+const LANES: usize = 8;
+
+/// Luma of a pixel and of those to the right, below and diagonally below.
+type Quad = [f32; 4];
+
 /// Stream of hashed random numbers.
 pub struct Random(pub u32);
 
@@ -41,28 +49,126 @@ impl Random {
     }
 }
 
-/// Matching window of one reference pixel: offsets are implicit, weights sum to 1.
-pub struct Window {
-    /// Weight per tap.
-    pub weights: [f32; TAPS * TAPS],
+/// Matching window of one reference pixel. The weights of all taps sum to 1. The middle tap is left
+/// out: in every source, values are relative to its value.
+struct Window {
+    /// Weight per outer tap.
+    weights: [f32; OUTER],
     /// Weight × (luma − weighted mean).
-    pub centred: [f32; TAPS * TAPS],
+    centred: [f32; OUTER],
     /// Weighted variance.
-    pub variance: f32,
+    variance: f32,
 }
 
 /// Inputs of a pass.
 pub struct Inputs<'a> {
     /// Luma of all views, one after the other.
-    pub luma: &'a [f32],
+    luma: &'a [f32],
+    /// The same for the sources, with the neighbours of each pixel.
+    quads: &'a [Quad],
     /// Source views of all references.
-    pub sources: &'a [SourceView],
+    sources: &'a [SourceView],
     /// The reference and the search.
-    pub reference: ReferenceView,
+    reference: ReferenceView,
 }
 
-fn offset(tap: usize) -> i32 {
-    (tap as i32 - (TAPS as i32 - 1) / 2) * shared::TAP_STEP
+/// Offsets of the outer taps from the middle, row by row, pixels.
+const OFFSETS: [[f32; OUTER]; 2] = {
+    let mut offsets = [[0.0; OUTER]; 2];
+    let mut k = 0;
+    while k < OUTER {
+        let tap = if k < OUTER / 2 { k } else { k + 1 };
+        let middle = (TAPS - 1) / 2;
+        offsets[0][k] = (tap % TAPS) as f32 - middle as f32;
+        offsets[1][k] = (tap / TAPS) as f32 - middle as f32;
+        offsets[0][k] *= shared::TAP_STEP as f32;
+        offsets[1][k] *= shared::TAP_STEP as f32;
+        k += 1;
+    }
+    offsets
+};
+
+/// A window in a source view: homogeneous pixel of its middle, and its change per pixel along x and
+/// y of the reference.
+struct Warp {
+    middle: Vec3,
+    along_x: Vec3,
+    along_y: Vec3,
+}
+
+/// Σ w v, Σ w v² and Σ c v over the outer taps of a warped window, with v the luma of a source
+/// relative to that at the middle tap.
+#[inline(always)]
+fn moments_of(
+    quads: &[Quad],
+    width: usize,
+    limit: [f32; 2],
+    base: f32,
+    warp: &Warp,
+    window: &Window,
+) -> [f32; 3] {
+    let Warp { middle, along_x, along_y } = *warp;
+    let (mut fx, mut fy, mut index) = ([0.0f32; OUTER], [0.0f32; OUTER], [0i32; OUTER]);
+    for k in 0..OUTER {
+        let (dx, dy) = (OFFSETS[0][k], OFFSETS[1][k]);
+        let inverse = 1.0 / (middle.z + along_x.z * dx + along_y.z * dy).max(1e-6);
+        let x = (middle.x + along_x.x * dx + along_y.x * dy) * inverse - 0.5;
+        let y = (middle.y + along_x.y * dx + along_y.y * dy) * inverse - 0.5;
+        let (x, y) = (x.max(0.0).min(limit[0]), y.max(0.0).min(limit[1]));
+        let (ix, iy) = (x as i32, y as i32);
+        (fx[k], fy[k]) = (x - ix as f32, y - iy as f32);
+        index[k] = iy * width as i32 + ix;
+    }
+    let mut corners = [[0.0f32; OUTER]; 4];
+    for k in 0..OUTER {
+        let quad = quads[index[k] as usize];
+        for c in 0..4 {
+            corners[c][k] = quad[c];
+        }
+    }
+    let mut sums = [[0.0f32; LANES]; 3];
+    for first in (0..OUTER).step_by(LANES) {
+        for lane in 0..LANES {
+            let k = first + lane;
+            let left = corners[0][k] + fy[k] * (corners[2][k] - corners[0][k]);
+            let right = corners[1][k] + fy[k] * (corners[3][k] - corners[1][k]);
+            let value = left + fx[k] * (right - left) - base;
+            sums[0][lane] += window.weights[k] * value;
+            sums[1][lane] += window.weights[k] * value * value;
+            sums[2][lane] += window.centred[k] * value;
+        }
+    }
+    sums.map(|lanes| lanes.iter().sum())
+}
+
+/// [`moments_of`] with vectors of eight numbers.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+fn moments_avx2(
+    quads: &[Quad],
+    width: usize,
+    limit: [f32; 2],
+    base: f32,
+    warp: &Warp,
+    window: &Window,
+) -> [f32; 3] {
+    moments_of(quads, width, limit, base, warp, window)
+}
+
+fn moments(
+    quads: &[Quad],
+    width: usize,
+    limit: [f32; 2],
+    base: f32,
+    warp: &Warp,
+    window: &Window,
+) -> [f32; 3] {
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has AVX2.
+        return unsafe { moments_avx2(quads, width, limit, base, warp, window) };
+    }
+    moments_of(quads, width, limit, base, warp, window)
 }
 
 impl Inputs<'_> {
@@ -73,7 +179,7 @@ impl Inputs<'_> {
     }
 
     /// Weights and moments of the window around a pixel; taps beyond the border repeat it.
-    pub fn window(&self, x: i32, y: i32) -> Window {
+    fn window(&self, x: i32, y: i32) -> Window {
         let r = &self.reference;
         let image = &self.luma[r.first as usize..];
         let luma_at = |x: i32, y: i32| {
@@ -81,48 +187,32 @@ impl Inputs<'_> {
             image[(y as u32 * r.width + x as u32) as usize]
         };
         let centre = luma_at(x, y);
-        let mut weights = [0.0; TAPS * TAPS];
-        let mut values = [0.0; TAPS * TAPS];
-        let (mut sum, mut mean, mut square) = (0.0, 0.0, 0.0);
-        for j in 0..TAPS {
-            for i in 0..TAPS {
-                let (dx, dy) = (offset(i), offset(j));
-                // Relative to the centre, which keeps the variance exact in f32.
-                let value = luma_at(x + dx, y + dy) - centre;
-                let space = (dx * dx + dy * dy) as f32 / (2.0 * SIGMA_SPACE * SIGMA_SPACE);
-                let weight = (-value.abs() / SIGMA_COLOUR - space).exp();
-                weights[j * TAPS + i] = weight;
-                values[j * TAPS + i] = value;
-                sum += weight;
-                mean += weight * value;
-                square += weight * value * value;
-            }
+        let (mut weights, mut values) = ([0.0; OUTER], [0.0; OUTER]);
+        // The middle tap has weight 1 and value 0.
+        let (mut sum, mut mean, mut square) = (1.0, 0.0, 0.0);
+        for k in 0..OUTER {
+            let (dx, dy) = (OFFSETS[0][k], OFFSETS[1][k]);
+            // Relative to the centre, which keeps the variance exact in f32.
+            let value = luma_at(x + dx as i32, y + dy as i32) - centre;
+            let space = (dx * dx + dy * dy) / (2.0 * SIGMA_SPACE * SIGMA_SPACE);
+            let weight = (-value.abs() / SIGMA_COLOUR - space).exp();
+            weights[k] = weight;
+            values[k] = value;
+            sum += weight;
+            mean += weight * value;
+            square += weight * value * value;
         }
         mean /= sum;
-        let mut centred = [0.0; TAPS * TAPS];
-        for k in 0..TAPS * TAPS {
+        let mut centred = [0.0; OUTER];
+        for k in 0..OUTER {
             weights[k] /= sum;
             centred[k] = weights[k] * (values[k] - mean);
         }
         Window { weights, centred, variance: (square / sum - mean * mean).max(0.0) }
     }
 
-    /// Bilinear luma of a source view at continuous pixel coordinates, clamped to the border.
-    fn sample(&self, source: &SourceView, u: f32, v: f32) -> f32 {
-        let [width, height, first, _] = source.size;
-        let x = (u - 0.5).clamp(0.0, width as f32 - 1.001);
-        let y = (v - 0.5).clamp(0.0, height as f32 - 1.001);
-        let (ix, iy) = (x as usize, y as usize);
-        let (fx, fy) = (x - ix as f32, y - iy as f32);
-        let k = first as usize + iy * width as usize + ix;
-        let w = width as usize;
-        let top = self.luma[k] + fx * (self.luma[k + 1] - self.luma[k]);
-        let bottom = self.luma[k + w] + fx * (self.luma[k + w + 1] - self.luma[k + w]);
-        top + fy * (bottom - top)
-    }
-
     /// 1 − ZNCC of the window warped by `plane` into one source view, at most `COST_LIMIT`.
-    pub fn source_cost(&self, source: &SourceView, window: &Window, ray: Vec3, plane: Vec3) -> f32 {
+    fn source_cost(&self, source: &SourceView, window: &Window, ray: Vec3, plane: Vec3) -> f32 {
         let rows = source.forward.map(Vec4::from);
         let [fx, fy, ..] = self.reference.intrinsics;
         let apply = |v: Vec4| Vec3::new(rows[0].dot(v), rows[1].dot(v), rows[2].dot(v));
@@ -136,19 +226,16 @@ impl Inputs<'_> {
         }
         let along_x = apply(Vec4::new(1.0, 0.0, 0.0, plane.x)) / fx;
         let along_y = apply(Vec4::new(0.0, 1.0, 0.0, plane.y)) / fy;
-        let base = self.sample(source, u, v);
-        let (mut mean, mut square, mut covariance) = (0.0f32, 0.0f32, 0.0f32);
-        for j in 0..TAPS {
-            for i in 0..TAPS {
-                let q = centre + along_x * offset(i) as f32 + along_y * offset(j) as f32;
-                let inverse = 1.0 / q.z.max(1e-6);
-                let value = self.sample(source, q.x * inverse, q.y * inverse) - base;
-                let k = j * TAPS + i;
-                mean += window.weights[k] * value;
-                square += window.weights[k] * value * value;
-                covariance += window.centred[k] * value;
-            }
-        }
+        let [width, height, first, _] = source.size;
+        let quads = &self.quads[first as usize..(first + width * height) as usize];
+        let limit = [width, height].map(|n| n as f32 - 1.001);
+        let (bx, by) = ((u - 0.5).clamp(0.0, limit[0]), (v - 0.5).clamp(0.0, limit[1]));
+        let [top, right, below, diagonal] = quads[by as usize * width as usize + bx as usize];
+        let (fx, fy) = (bx.fract(), by.fract());
+        let (left, right) = (top + fy * (below - top), right + fy * (diagonal - right));
+        let base = left + fx * (right - left);
+        let warp = Warp { middle: centre, along_x, along_y };
+        let [mean, square, covariance] = moments(quads, width as usize, limit, base, &warp, window);
         let variance = (square - mean * mean).max(0.0);
         let scale = ((window.variance + VARIANCE_FLOOR) * (variance + VARIANCE_FLOOR)).sqrt();
         (1.0 - covariance / scale).min(COST_LIMIT)
@@ -187,7 +274,7 @@ impl Inputs<'_> {
 
     /// Aggregated cost of a plane at a pixel: the sorted source costs mixed by
     /// [`shared::VIEW_SHARES`].
-    pub fn cost(&self, planes: &[Vec4], window: &Window, x: i32, y: i32, ray: Vec3, plane: Vec3) -> f32 {
+    fn cost(&self, planes: &[Vec4], window: &Window, x: i32, y: i32, ray: Vec3, plane: Vec3) -> f32 {
         let r = &self.reference;
         let mut best = [COST_LIMIT + r.geometric * GEOMETRIC_LIMIT; MAX_SOURCES];
         for source in &self.sources[r.first_source as usize..(r.first_source + r.sources) as usize] {
@@ -286,12 +373,16 @@ impl Inputs<'_> {
         // stale.
         let cost = total(current.truncate());
         let mut best = current.truncate().extend(cost);
+        // Neighbours often share a plane; its cost is known.
+        let (mut tried, mut count) = ([current.truncate(); 9], 1);
         for area in 0..8 {
             let Some(candidate) = self.area_best(own, x, y, area) else { continue };
             let inverse_depth = candidate.dot(ray);
-            if inverse_depth < r.range[0] || inverse_depth > r.range[1] || candidate == best.truncate() {
+            let known = tried[..count].contains(&candidate);
+            if inverse_depth < r.range[0] || inverse_depth > r.range[1] || known {
                 continue;
             }
+            (tried[count], count) = (candidate, count + 1);
             let cost = total(candidate);
             if cost < best.w {
                 best = candidate.extend(cost);
@@ -356,9 +447,10 @@ impl Inputs<'_> {
     }
 }
 
-/// CPU reference of the GPU matcher.
+/// Matcher on the host.
 pub struct CpuMatcher {
     luma: Vec<f32>,
+    quads: Vec<Quad>,
     sources: Vec<SourceView>,
     planes: Vec<Vec4>,
 }
@@ -366,24 +458,48 @@ pub struct CpuMatcher {
 impl CpuMatcher {
     /// Takes `luma` and `planes` (π, cost) of all views, one after the other.
     pub fn new(luma: Vec<f32>, sources: Vec<SourceView>, planes: Vec<Vec4>) -> Self {
-        CpuMatcher { luma, sources, planes }
+        let mut quads = vec![[0.0; 4]; luma.len()];
+        let mut done = Vec::new();
+        for source in &sources {
+            let [width, height, first] = [0, 1, 2].map(|k| source.size[k] as usize);
+            if done.contains(&first) {
+                continue;
+            }
+            done.push(first);
+            let image = &luma[first..first + width * height];
+            let own = quads[first..first + width * height].par_iter_mut().with_min_len(4096).enumerate();
+            own.for_each(|(k, quad)| {
+                let (x, y) = (k % width, k / width);
+                let (right, below) = ((x + 1).min(width - 1), (y + 1).min(height - 1) * width);
+                *quad = [image[k], image[y * width + right], image[below + x], image[below + right]];
+            });
+        }
+        CpuMatcher { luma, quads, sources, planes }
+    }
+}
+
+impl CpuMatcher {
+    fn inputs(&self, reference: &ReferenceView) -> Inputs<'_> {
+        let CpuMatcher { luma, quads, sources, .. } = self;
+        Inputs { luma, quads, sources, reference: *reference }
     }
 }
 
 impl Matcher for CpuMatcher {
     fn sweep(&mut self, reference: &ReferenceView) -> Result<()> {
         let (width, first) = (reference.width as usize, reference.first as usize);
-        let inputs = Inputs { luma: &self.luma, sources: &self.sources, reference: *reference };
+        let inputs = self.inputs(reference);
         let pixels = width * reference.height as usize;
-        self.planes[first..first + pixels]
-            .par_iter_mut()
-            .enumerate()
-            .for_each(|(k, plane)| *plane = inputs.sweep((k % width) as i32, (k / width) as i32));
+        let swept: Vec<Vec4> = (0..pixels)
+            .into_par_iter()
+            .map(|k| inputs.sweep((k % width) as i32, (k / width) as i32))
+            .collect();
+        self.planes[first..first + pixels].copy_from_slice(&swept);
         Ok(())
     }
     fn refine(&mut self, reference: &ReferenceView) -> Result<()> {
         let (width, first) = (reference.width as usize, reference.first as usize);
-        let inputs = Inputs { luma: &self.luma, sources: &self.sources, reference: *reference };
+        let inputs = self.inputs(reference);
         let of_colour = |k: &usize| (k % width + k / width) % 2 == reference.parity as usize;
         let pixels = width * reference.height as usize;
         let active: Vec<usize> = (0..pixels).filter(of_colour).collect();

@@ -45,6 +45,7 @@ use super::frame::{
     entry_bytes,
 };
 use super::fused_update::{self, SplatAdam};
+use super::label_weights::{self, LabelSets, LabelWeights};
 use super::project::DEPTH_BITS;
 use super::project_backward::ShGradientKernel;
 use super::sort::{Prepared, Sort};
@@ -441,6 +442,50 @@ impl Rasterizer {
                 None => return Ok(()),
             }
         }
+    }
+
+    /// Adds the blending weights of the last set view to `sums`, by label. `labels` are
+    /// [levels, H·W], −1 for pixels without one. Grows tile lists that are too short.
+    pub fn add_label_weights(
+        &mut self,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        labels: &[i32],
+        sums: &mut LabelWeights,
+    ) -> Result<()> {
+        self.check(params)?;
+        let mut is_projected = false;
+        for index in 0..self.frame.bands.count() {
+            let band = self.frame.bands.get(index);
+            let labels = self.frame.bands.cut_inner(&band, labels, -1);
+            let sets = LabelSets::new(&self.device, &self.frame, &band, &labels)?;
+            let mut row = band.inner.start;
+            // Strips become narrower where the lists of one do not fit.
+            while let Some(tiles) = self.strips(&band, row..band.inner.end).into_iter().next() {
+                let mut rec = Recorder::new(&self.device, "tile lists");
+                if !is_projected {
+                    self.record_projection(&mut rec, params, options);
+                }
+                self.record_lists(&mut rec, params, &tiles, Lists::Used);
+                rec.download(&self.frame.status);
+                rec.run()?;
+                is_projected = true;
+                if let Some(needed) = self.overflow()? {
+                    self.grow(needed)?;
+                    continue;
+                }
+                let room = label_weights::SLOTS * self.frame.lists.capacity;
+                let weights = self.device.buffer::<f32>("label weights", room)?;
+                for first_slot in sets.dispatches(&tiles) {
+                    let mut rec = Recorder::new(&self.device, "label weights");
+                    sets.record(&mut rec, &self.frame, &tiles, first_slot, &weights);
+                    rec.run()?;
+                    sets.add(&self.frame, &tiles, first_slot, &weights, sums)?;
+                }
+                row = (tiles.rows.end * TILE) as usize;
+            }
+        }
+        Ok(())
     }
 
     /// Number of entries that a frame needed since the last [`Rasterizer::grow`], if they did not

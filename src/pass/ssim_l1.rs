@@ -198,7 +198,8 @@ impl SsimL1 {
     /// Records the pass for a band. `rendered` and `gradient` are planar `[≥3, rows, W]` stacks
     /// with RGB first, `target` is `[3, rows, W]`. With `covered`, the sum of the pixel weights of
     /// the whole image, `target` is `[4, rows, W]`, the last plane the weights. Writes Σ|x−y| of
-    /// the band to `loss[slot]` and ΣSSIM to `loss[slot+1]`: see [`SsimL1::loss`].
+    /// the band to `loss[slot]` and, unless its weight is 0, ΣSSIM to `loss[slot+1]`: see
+    /// [`SsimL1::loss`]. `weights` are those of L1 and 1 − SSIM.
     pub fn record(
         &self,
         rec: &mut Recorder,
@@ -210,19 +211,28 @@ impl SsimL1 {
         weights: [f64; 2],
         loss: (&Buffer<f32>, u32),
     ) {
-        rec.pass("SSIM + L1");
+        let with_ssim = weights[1] != 0.0;
+        rec.pass(if with_ssim { "SSIM + L1" } else { "L1" });
         let (width, height) = (self.bands.width as i32, self.bands.rows as i32);
         let (first, end) = ((band.inner.start - band.top) as i32, (band.inner.end - band.top) as i32);
         let (count, weighted) = (self.values(covered), i32::from(covered.is_some()));
         let strips = |n: usize| n.div_ceil(STRIP) as u32;
         let columns = [(width as u32).div_ceil(64), strips(self.bands.rows), CHANNELS as u32];
-        let call = shaders::ssim_columns::call(
-            &shaders::ssim_columns::Bindings { rendered, target, means: &self.means, moments: &self.moments },
-            &shaders::ssim_columns::Push { width, height, weighted },
-        );
-        rec.dispatch(call, columns);
-        self.record_rows(rec, first, end);
+        if with_ssim {
+            let call = shaders::ssim_columns::call(
+                &shaders::ssim_columns::Bindings {
+                    rendered,
+                    target,
+                    means: &self.means,
+                    moments: &self.moments,
+                },
+                &shaders::ssim_columns::Push { width, height, weighted },
+            );
+            rec.dispatch(call, columns);
+            self.record_rows(rec, first, end);
+        }
         let call = shaders::ssim_gradient::call(
+            shaders::ssim_gradient::Variant { ssim: u32::from(with_ssim) },
             &shaders::ssim_gradient::Bindings {
                 rendered,
                 target,
@@ -243,7 +253,9 @@ impl SsimL1 {
         );
         rec.dispatch(call, columns);
         sum::record(rec, &self.l1_sums, &self.partials, loss.0, loss.1);
-        sum::record(rec, &self.ssim_sums, &self.partials, loss.0, loss.1 + 1);
+        if with_ssim {
+            sum::record(rec, &self.ssim_sums, &self.partials, loss.0, loss.1 + 1);
+        }
     }
 
     fn record_rows(&self, rec: &mut Recorder, first: i32, end: i32) {

@@ -3,12 +3,13 @@ use super::answer::Answers;
 use super::outcome::{LanguageOutcome, RunOutcome};
 use super::plan::RunPlan;
 use super::summary::confidence;
-use crate::fit::{self, CurvePoint, LanguagePoint, Preset};
+use super::view::DecodedFrame;
+use crate::fit::{CurvePoint, LanguagePoint, Preset};
 use crate::infer::ModelStatus;
 use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
 use crate::report::{self, Curve, ModelUsed};
-use crate::scene::{Camera, LEVEL_NAMES, Lens};
+use crate::scene::{Camera, LEVEL_NAMES, Lens, LevelField};
 use crate::{Error, Result, files};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
@@ -146,7 +147,7 @@ pub fn read(scene: &Path, remedy: &str) -> Result<RunRecord> {
 
 fn statistics(o: &RunOutcome) -> Statistics {
     let language = o.language.as_ref();
-    let levels: Vec<Value> = language.map_or_else(Vec::new, levels_json);
+    let levels: Vec<Value> = language.map_or_else(Vec::new, |l| levels_json(l, &o.frames));
     let answers = language.map_or(&[][..], |l| &l.answers);
     let other = json!({
         "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
@@ -180,16 +181,25 @@ fn statistics(o: &RunOutcome) -> Statistics {
     Statistics { geometry, other }
 }
 
-fn levels_json(language: &LanguageOutcome) -> Vec<Value> {
+fn levels_json(language: &LanguageOutcome, frames: &[DecodedFrame]) -> Vec<Value> {
     let levels = LEVEL_NAMES.iter().zip(&language.field.levels).enumerate();
     levels
         .map(|(index, (name, level))| {
             json!({
                 "level": name, "codes": level.codebook.len(), "min_chord": level.codebook.min_chord,
-                "decode_accuracy": fit::decode_accuracy(&language.curve, index),
+                "decode_accuracy": decode_accuracy(level, index, frames),
             })
         })
         .collect()
+}
+
+/// Share of the labelled pixels of the photos that decode to their label; `None` without any.
+fn decode_accuracy(level: &LevelField, index: usize, frames: &[DecodedFrame]) -> Option<f64> {
+    let pairs = level.targets.iter().zip(frames).flat_map(|(t, f)| t.data.iter().zip(&f.codes[index].data));
+    let (right, labelled) = pairs
+        .filter(|(label, _)| **label >= 0)
+        .fold((0usize, 0usize), |(right, n), (label, code)| (right + usize::from(label == code), n + 1));
+    (labelled > 0).then(|| right as f64 / labelled as f64)
 }
 
 /// Figures of the photos that joined a scene; `None` for a new scene.
@@ -267,7 +277,11 @@ pub(super) fn curves(o: &RunOutcome) -> Vec<Curve> {
     vec![
         colour_curve("loss", "", |p| p.loss),
         colour_curve("PSNR of render and photo", "dB", |p| p.psnr),
-        colour_curve("SSIM of render and photo", "", |p| p.ssim),
+        Curve {
+            name: "SSIM of render and photo",
+            unit: "",
+            points: rgb.curve.iter().filter_map(|p| Some((p.step as f64, p.ssim?))).collect(),
+        },
         colour_curve("splats", "", |p| p.splats as f64),
         // The first measurement of a model precedes every step and has no loss.
         language_curve("language loss", "", |p| (p.loss > 0.0).then_some(p.loss)),

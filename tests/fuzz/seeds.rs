@@ -116,6 +116,7 @@ fn cloud() -> PointCloud {
         confidence: vec![1.0; n],
         view: vec![0; n],
         radius: vec![0.0; n],
+        normals: Vec::new(),
     }
 }
 

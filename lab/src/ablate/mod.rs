@@ -18,7 +18,7 @@ mod tables;
 
 pub use data::{DataSet, Layout};
 pub use measure::Measurement;
-pub use runner::{RowFigures, Runner, feature_bytes};
+pub use runner::{Prepared, RowFigures, Runner, feature_bytes};
 pub use setup::{Available, Network, Regions, RowWork, Setup, Sources, TableRow};
 pub use spread::{Difference, Spread};
 pub use stages::{EmbeddingAgreement, Scored};

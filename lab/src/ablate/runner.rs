@@ -9,7 +9,8 @@ use super::stages::{
 };
 use crate::generate::regions::{self, InjectedErrors};
 use crate::{Error, Result};
-use splatvk::eval::{BACKGROUND_LABELS, GroundTruth, Split, TruthFrame};
+use serde::{Deserialize, Serialize};
+use splatvk::eval::{BACKGROUND_LABELS, EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
 use splatvk::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
 use splatvk::gpu::Device;
 use splatvk::infer::Registry;
@@ -17,16 +18,19 @@ use splatvk::infer::installed::{Installed, Task, catalogue, inventory};
 use splatvk::language::sam::SamOptions;
 use splatvk::language::{Language, ViewMasks};
 use splatvk::photo;
-use splatvk::pipeline::{Graph, Output, Store};
+use splatvk::pipeline::{Context, Graph, Output, Stage, Store};
+use splatvk::pose::Geometry;
 use splatvk::progress::{Progress, Recorded};
-use splatvk::query::TextQuery;
+use splatvk::query::{QueryOptions, TextQuery};
 use splatvk::run::ask;
+use splatvk::run::method::LIFT;
+use splatvk::run::score::{Questions, ScoredScene, score_field};
 use splatvk::run::sources::{
     self, DepthSources, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources,
     PosedPhotos, SourceChoice,
 };
 use splatvk::run::stages::{self, CameraOrigin, PlacedPhotos, SharedEncoder};
-use splatvk::scene::Camera;
+use splatvk::scene::{Camera, LanguageField};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -50,6 +54,19 @@ pub struct RowFigures {
     pub training_seconds: f64,
     /// Sum of the seconds of all stages from photos to the finished scene, shared ones included.
     pub total_seconds: f64,
+}
+
+/// Outputs of all stages that precede the training of splats.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct Prepared {
+    /// Photos of the scene.
+    pub placed: PlacedPhotos,
+    /// Their cameras, depth and points.
+    pub geometry: Geometry,
+    /// Codes of their masks.
+    pub language: Language,
+    /// Sum of the seconds of the stages up to the geometry.
+    pub seconds: f64,
 }
 
 /// Runs setups on one data set and one device, and keeps their outputs.
@@ -81,6 +98,7 @@ const PASSING: &[&str] = &["language"];
 struct Stages {
     build: GraphBuilder,
     placed: Output<PlacedPhotos>,
+    geometry: Output<Geometry>,
     trained: Output<Trained>,
     aligned: Output<Language>,
     language: Output<TrainedLanguage>,
@@ -185,8 +203,50 @@ impl<'a> Runner<'a> {
         }
     }
 
+    /// The progress of all work.
+    pub fn progress(&self) -> &'a dyn Progress {
+        self.progress
+    }
+
+    /// Device and networks.
+    pub fn environment(&self) -> (&'a Device, &'a Registry) {
+        (self.device, self.registry)
+    }
+
+    /// Runs all stages of a setup that precede the training of splats.
+    pub fn prepared(&mut self, setup: &Setup, preset: Preset) -> Result<Prepared> {
+        let s = self.stages_of(setup, preset)?;
+        let targets = [s.placed.target(), s.geometry.target(), s.aligned.target()];
+        let progress = Recorded::new(self.progress);
+        let made = s.build.graph.run(&targets, self.device, self.registry, &self.store, &progress)?;
+        let (placed, geometry) = ((*made.get(s.placed)?).clone(), (*made.get(s.geometry)?).clone());
+        let seconds = made.seconds_in_all(s.geometry);
+        Ok(Prepared { placed, geometry, language: (*made.get(s.aligned)?).clone(), seconds })
+    }
+
+    /// Scores a training of [`Runner::prepared`] by protocol `field`; with `words`, lifts its language
+    /// and scores true masks with synthetic features.
+    pub fn scored(&self, prepared: &Prepared, trained: &Trained, words: bool) -> Result<EvalReport> {
+        let context = Context { device: self.device, registry: self.registry, progress: self.progress };
+        let (mut field, mut queries) = (LanguageField::default(), Vec::new());
+        if words {
+            let options = LanguageOptions::preset(Preset::Draft);
+            let lift = stages::TrainLanguage { recipe: LIFT.recipe, options };
+            field = lift.run((&prepared.placed, trained, &prepared.language), &context)?.field;
+            queries = self.phrases().iter().map(|p| regions::query(p)).collect();
+        }
+        let evaluation = Evaluation::new((*self.truth).clone(), &trained.cameras, None)?;
+        let scene = ScoredScene { splats: &trained.splats, backdrop: &trained.backdrop, field: &field };
+        let questions = Questions { queries: &queries, options: QueryOptions::default() };
+        score_field(self.device, scene, questions, evaluation, false, self.progress, &mut |_, _| Ok(()))
+    }
+
     /// Builds the graph of a setup, up to its scores.
     fn stages(&mut self, setup: &Setup) -> Result<Stages> {
+        self.stages_of(setup, Preset::Draft)
+    }
+
+    fn stages_of(&mut self, setup: &Setup, preset: Preset) -> Result<Stages> {
         let frames = self.frames(setup.views)?;
         let paths: Vec<PathBuf> = frames.iter().map(|f| self.truth.folder.join(&f.file)).collect();
         let photos = photo::load_all(&paths, self.progress)?;
@@ -199,7 +259,7 @@ impl<'a> Runner<'a> {
             sam: SamOptions::default(),
             given_features,
             depth_prior: sources::default::<DepthSources>(),
-            preset: Preset::Draft,
+            preset,
             seed: self.seed,
         };
         let posed = if setup.true_cameras {
@@ -233,7 +293,7 @@ impl<'a> Runner<'a> {
                 build.graph.add(score, scene)
             }
         };
-        Ok(Stages { build, placed, trained, aligned, language, scored, queries })
+        Ok(Stages { build, placed, geometry, trained, aligned, language, scored, queries })
     }
 
     fn rgb_options(&self, setup: &Setup) -> RgbOptions {

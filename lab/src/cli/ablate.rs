@@ -122,7 +122,7 @@ fn earlier(path: &Path) -> Result<Vec<Measurement>> {
 
 /// Opens data sets. Their names are the last components of their paths, as many as make all names
 /// distinct.
-fn data_sets(folders: &[PathBuf], layout: LayoutArg) -> Result<Vec<DataSet>> {
+pub(super) fn data_sets(folders: &[PathBuf], layout: LayoutArg) -> Result<Vec<DataSet>> {
     let absolute = |f: &PathBuf| f.canonicalize().unwrap_or_else(|_| f.clone());
     let parts: Vec<Vec<String>> = folders
         .iter()

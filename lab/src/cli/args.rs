@@ -1,10 +1,12 @@
 //! Command-line arguments.
 use crate::ablate::{Layout, TABLES};
+use crate::curve::Variant;
 use crate::generate::{Flat, Spoil};
 use crate::protocol::ProtocolKind;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use splatvk::cli::args::{DeviceArgs, GlobalArgs, whole};
+use splatvk::fit::Preset;
 use std::path::PathBuf;
 
 /// Tables of the paper's experiments, and data with ground truth
@@ -24,6 +26,8 @@ pub struct Lab {
 pub enum Command {
     /// Data with ground truth → the tables of the paper's experiments
     Ablate(AblateArgs),
+    /// Data with ground truth → quality of a training against its seconds
+    Curve(CurveArgs),
     /// Synthetic scene with ground truth, as hard as asked
     Generate(GenerateArgs),
     /// Scene against the labels of LERF-OVS, 3D-OVS or ScanNet → figures of their protocols
@@ -92,6 +96,10 @@ fn spoils() -> impl TypedValueParser<Value = Spoil> {
 fn flats() -> impl TypedValueParser<Value = Flat> {
     one_of(&Flat::ALL)
 }
+
+/// Presets whose trainings curves compare.
+static PRESETS: [(Preset, &str, &str); 2] =
+    [(Preset::Draft, "draft", "Fewer splats"), (Preset::Default, "default", "The preset of run on a GPU")];
 
 /// Parser of one of a list of (value, name, help text).
 fn one_of<T: Copy + Send + Sync + 'static>(
@@ -191,6 +199,49 @@ pub struct AblateArgs {
     /// Optimisation steps of the language stage [default: 30]
     #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
     pub language_iterations: Option<usize>,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatlab curve`
+#[derive(Debug, Args)]
+pub struct CurveArgs {
+    /// Folders with ground_truth.json, photos and masks
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    pub data: Vec<PathBuf>,
+    /// Trainings to compare, each the preset with some options changed, as steps=200,half-res=0.5;
+    /// `preset` changes none [default: preset]
+    #[arg(long, value_name = "NAME=VALUE,...", num_args = 1..)]
+    pub variant: Vec<Variant>,
+    /// Preset of cameras, stereo and training
+    #[arg(long, value_parser = one_of(&PRESETS), default_value = "draft", value_name = "PRESET")]
+    pub preset: Preset,
+    /// Points of a curve; the last is the end of the training
+    #[arg(long, default_value_t = 8, value_name = "N", value_parser = whole::<usize>(1..))]
+    pub points: usize,
+    /// Lift language at every point and score it: true masks, synthetic features
+    #[arg(long)]
+    pub words: bool,
+    /// Photos [default: all train frames, at most 4]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
+    pub views: Option<usize>,
+    /// Take the true cameras
+    #[arg(long)]
+    pub true_cameras: bool,
+    /// Seed of cameras, stereo and training
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u64>(0..))]
+    pub seed: u64,
+    /// Folder that keeps cameras, depth and masks of every data set: later calls, also of other
+    /// revisions, train on the same
+    #[arg(long, value_name = "DIR")]
+    pub inputs: Option<PathBuf>,
+    /// File for all curves, as JSON
+    #[arg(long, value_name = "FILE")]
+    pub out: Option<PathBuf>,
+    /// Write over the file of --out
+    #[arg(long)]
+    pub force: bool,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

@@ -2,6 +2,7 @@
 //! of `splatvk`.
 mod ablate;
 pub mod args;
+mod curve;
 mod eval;
 mod generate;
 
@@ -30,6 +31,10 @@ impl Program for Lab {
             Command::Ablate(mut args) => {
                 args.device.provider = self.global.provider;
                 ablate::ablate(&args)
+            }
+            Command::Curve(mut args) => {
+                args.device.provider = self.global.provider;
+                curve::curve(&args)
             }
             Command::Generate(args) => generate::generate(&args),
             Command::Eval(mut args) => {

@@ -5,6 +5,7 @@ use crate::support::{
 };
 use splatvk::gpu::{Device, Recorder};
 use splatvk::math::Random;
+use splatvk::pass::label_weights::{self, LabelWeights};
 use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
 use splatvk::pass::raster_forward::{Cutoffs, ReferenceScene, walk};
 use splatvk::pass::{
@@ -222,6 +223,27 @@ pub fn pairs(device: &Device) {
     assert!((blended - expected as f64).abs() <= 1.0, "{blended} of {expected}");
     let listed: usize = raster.tile_lists().unwrap().iter().map(Vec::len).sum();
     assert!(evaluated >= blended && evaluated <= 64.0 * listed as f64, "{evaluated} {listed}");
+}
+
+/// Blending weights by label: tiles of up to six label sets, pixels without a label.
+pub fn label_weights(device: &Device) {
+    let scene = scene(60, 0, 0, 1054);
+    let (params, mut raster) = scene.upload(device);
+    let stripes = (0..27 * 19).map(|p| (p % 27 + p / 27) / 4 % 3);
+    let columns = (0..27 * 19).map(|p| if p % 27 / 3 % 4 == 0 { -1 } else { 3 + p % 27 / 3 % 2 });
+    let labels: Vec<i32> = stripes.chain(columns).collect();
+    let mut sums = LabelWeights::new(60);
+    raster.add_label_weights(&params, &scene.options, &labels, &mut sums).unwrap();
+    let forward = scene.reference();
+    let reference = ReferenceScene {
+        projected: &forward.projected,
+        features: &[],
+        feature_dim: 0,
+        order: &forward.order,
+        view: &scene.view,
+    };
+    let difference = sums.difference(&label_weights::reference(&reference, &labels));
+    assert!(difference < 1e-3, "{difference}");
 }
 
 pub fn decode(device: &Device) {

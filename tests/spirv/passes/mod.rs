@@ -26,6 +26,7 @@ pub const PLAIN: &[(&str, Scene)] = &[
     ("lists by sorting", frames::lists_by_sorting),
     ("edge cases", frames::edge_cases),
     ("pairs", frames::pairs),
+    ("label weights", frames::label_weights),
     ("decode", frames::decode),
     ("pack", frames::pack),
     ("depth loss", losses::depth),

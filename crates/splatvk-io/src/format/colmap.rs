@@ -288,7 +288,14 @@ pub fn read_points(folder: &Path) -> Result<PointCloud> {
     let points = points.map_err(|e| Error::input(format!("{}: {e}", path.display())))?;
     let n = points.len();
     let (positions, colours) = points.into_iter().unzip();
-    Ok(PointCloud { positions, colours, confidence: vec![1.0; n], view: vec![0; n], radius: vec![0.0; n] })
+    Ok(PointCloud {
+        positions,
+        colours,
+        confidence: vec![1.0; n],
+        view: vec![0; n],
+        radius: vec![0.0; n],
+        normals: Vec::new(),
+    })
 }
 
 type Point = ([f32; 3], [f32; 3]);

@@ -91,6 +91,8 @@ fn fuse_view(
         cloud.view.push(view as u8);
         let pixels = if is_sky(k) { SKY_STEP as f32 } else { 1.0 };
         cloud.radius.push(pixels * z / r.intrinsics[0]);
+        let normal = to_world.rotation * surface.planes[r.first as usize + k].as_dvec3();
+        cloud.normals.push(normal.normalize_or_zero().as_vec3().to_array());
     }
     added
 }

@@ -14,6 +14,10 @@ pub struct PointCloud {
     pub view: Vec<u8>,
     /// [N] footprint of one pixel at the point's depth, `z / f`, world units.
     pub radius: Vec<f32>,
+    /// [N, 3] unit normal of the surface, world axes, of either sign; zero where it is not known, and
+    /// empty where none is.
+    #[serde(default)]
+    pub normals: Vec<[f32; 3]>,
 }
 
 impl PointCloud {
@@ -32,10 +36,16 @@ impl PointCloud {
             confidence: rows_of(&self.confidence, rows),
             view: rows_of(&self.view, rows),
             radius: rows_of(&self.radius, rows),
+            normals: if self.normals.is_empty() { Vec::new() } else { rows_of(&self.normals, rows) },
         }
     }
     /// Appends the points of another cloud.
     pub fn append(&mut self, mut other: PointCloud) {
+        if !self.normals.is_empty() || !other.normals.is_empty() {
+            self.normals.resize(self.len(), [0.0; 3]);
+            other.normals.resize(other.len(), [0.0; 3]);
+            self.normals.append(&mut other.normals);
+        }
         self.positions.append(&mut other.positions);
         self.colours.append(&mut other.colours);
         self.confidence.append(&mut other.confidence);
