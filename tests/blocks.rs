@@ -118,13 +118,8 @@ fn colour_training_in_bands_matches_whole() {
     let (cameras, images) = photos(&test_device(), &truth, &[(320, 240), (240, 320), (600, 90), (317, 235)]);
     let mut start = truth.clone();
     start.sh.iter_mut().for_each(|v| *v *= 0.7);
-    let options = RgbOptions {
-        iterations: 8,
-        half_res: 0.0,
-        report_every: 1,
-        poses: None,
-        ..RgbOptions::preset(Preset::Draft)
-    };
+    let options =
+        RgbOptions { iterations: 8, report_every: 1, poses: None, ..RgbOptions::preset(Preset::Draft) };
     let scale = fit::scale::SceneScale::measure(&cameras, &truth.means);
     let trained = |bytes: u64| {
         let device = limited(bytes, true);

@@ -83,8 +83,6 @@ fn fit_recovers_perturbed_camera() {
     // 300 updates of the camera: rotation and translation have similar effects, so the last tenths
     // of a degree converge slowly.
     options.iterations = 900;
-    // The splats are fixed; at half resolution they would need another appearance.
-    options.half_res = 0.0;
     options.rates = fit::Rates::STILL;
     let rate = Exponential { start: 1e-3, end: 3e-5, steps: 900 };
     options.poses = Some(fit::pose::PoseOptions { start: 0, rate });
@@ -154,7 +152,6 @@ fn with_view_dependence(device: &Device, truth: &Splats, cameras: &[Camera], deg
         iterations: 1,
         rates: fit::Rates::STILL,
         poses: None,
-        half_res: 0.0,
         ..RgbOptions::preset(Preset::Draft)
     };
     let scale = fit::scale::SceneScale::measure(cameras, &start.means);

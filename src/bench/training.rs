@@ -24,8 +24,12 @@ pub fn colour(device: &Device, workload: &Workload, limits: (&Budget, &Roofline)
     device.reset_peak_memory();
     let target = [workload.target(device)?];
     let cameras = [workload.camera.clone()];
-    let options =
-        RgbOptions { rates: Rates::STILL, poses: None, half_res: 0.0, ..RgbOptions::preset(Preset::Default) };
+    let options = RgbOptions {
+        rates: Rates::STILL,
+        poses: None,
+        virtual_views: 0,
+        ..RgbOptions::preset(Preset::Default)
+    };
     let scale = SceneScale::measure(&cameras, &workload.splats.means);
     let photos = Photos { images: &target, cameras: &cameras, depths: None, coverage: &[] };
     let mut run = RgbRun::new(device, photos, &workload.splats, scale, &options)?;

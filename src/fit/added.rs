@@ -1,9 +1,9 @@
 //! Training of a scene with photos added later (docs/internals/method.md#photos-added-later): its
 //! splats are trained further, and surfaces that it lacks become new splats.
 use super::bounds::Bounds;
-use super::half_res::Photos;
 use super::init::splats_from_points;
 use super::options::RgbOptions;
+use super::photos::Photos;
 use super::rgb::{Trained, fit_with_unseen};
 use super::scale::SceneScale;
 use super::unseen::continued_surfaces;

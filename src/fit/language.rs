@@ -1,11 +1,11 @@
 //! Language stage: trains features of splats to render to the code of each pixel
 //! (docs/internals/method.md#language-training), `L = λ2·L_img + (1−λ2)·L_sem`, from lifted
 //! features.
-use super::half_res::Photos;
 use super::lift::{CodeTargets, code_length, lift};
 use super::losses::Losses;
 use super::model::{Model, not_finite};
 use super::options::{LanguageOptions, Start};
+use super::photos::Photos;
 use super::scale::SceneScale;
 use super::schedule::ViewOrder;
 use super::training::{self, StepReport, Trainer, Training};

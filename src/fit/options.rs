@@ -39,18 +39,6 @@ pub struct Rates {
 }
 
 impl Rates {
-    /// These rates times a factor, but for that of the means.
-    pub(super) fn scaled(&self, factor: f64) -> Rates {
-        Rates {
-            means: self.means,
-            log_scales: factor * self.log_scales,
-            quats: factor * self.quats,
-            opacity: factor * self.opacity,
-            sh_dc: factor * self.sh_dc,
-            sh_rest: factor * self.sh_rest,
-        }
-    }
-
     /// Rates of zero.
     pub const STILL: Rates = Rates {
         means: Exponential { start: 0.0, end: 0.0, steps: 1 },
@@ -80,13 +68,6 @@ pub struct RgbOptions {
     pub margin: f64,
     /// Learning rates.
     pub rates: Rates,
-    /// Share of the steps, from the first on, with the photos at half their resolution.
-    pub half_res: f64,
-    /// Share of the steps, from the first on, without the SSIM term.
-    pub without_ssim: f64,
-    /// Factor on the learning rates of the last step, other than that of the means, which has its
-    /// own schedule; log-linear from 1.
-    pub decay: f64,
     /// Blending weight, pixels, below which the colour of a splat hardly moves.
     pub colour_pixels: f64,
     /// Terms of the objective.
@@ -117,8 +98,7 @@ impl RgbOptions {
         match preset {
             Preset::Paper => Self::paper(),
             // Fewer steps need proportionally higher rates: with Adam a parameter moves by at most
-            // about rate × steps. Rates stay below the point where the loss oscillates (means: a
-            // tenth of a pixel per step).
+            // about rate × steps.
             Preset::Draft => Self::draft(),
             Preset::Default => Self::short(),
         }
@@ -147,20 +127,17 @@ impl RgbOptions {
     /// These options for continuing a scene of `known` photos with `new` more: each new photo may
     /// add its share of the splats.
     pub fn for_continuation(self, known: usize, new: usize) -> Self {
-        // Steps at half resolution, 0.6 of a run, would undo details of the scene and are omitted.
-        // There are a few more of the other steps, because new splats are untrained. With many
-        // photos, each is used as often as in a run with sixteen.
-        let steps = self.iterations.div_ceil(2).max(self.iterations * (known + new) / 16);
-        let mut options = RgbOptions { half_res: 0.0, virtual_views: 0, ..self.with_iterations(steps) };
+        // With many photos, each is used as often as in a run with sixteen.
+        let steps = self.iterations.max(self.iterations * (known + new) / 16);
+        let mut options = RgbOptions { virtual_views: 0, ..self.with_iterations(steps) };
         options.init.max_points = (options.init.max_points * new).div_ceil((known + new).max(1));
         options
     }
 
-    /// Options of the default preset, with most steps at half resolution. A thousand steps overfit
-    /// a few photos: 0.9 dB more on them, 0.3 less on views between them
-    /// (docs/internals/experiments.md#how-long-to-train).
+    /// Options of the default preset. A thousand steps overfit a few photos: 0.9 dB more on them, 0.3
+    /// less on views between them (docs/internals/experiments.md#how-long-to-train).
     fn short() -> Self {
-        RgbOptions { half_res: 0.6, ..Self::scaled(400, 2.0) }
+        RgbOptions { prune_every: 50, prune_from: 50, ..Self::scaled(150, 8.0) }
     }
 
     /// Options of the draft preset, with fewer splats: on breakfast two fifths less time and 0.4 dB
@@ -175,14 +152,15 @@ impl RgbOptions {
         let paper = Self::paper();
         RgbOptions {
             iterations,
-            // Stereo points are dense and have the right colour, so splats start nearly opaque:
-            // from an opacity of 0.1, the first hundred steps would only raise it.
+            // Stereo points are dense, on surfaces and of the right colour, so splats start as nearly
+            // opaque discs: from spheres of an opacity of 0.1, the first hundred steps would only
+            // flatten them and raise it.
             init: InitOptions {
                 max_points: 200_000,
-                opacity: 0.6,
-                footprint: 0.7,
+                opacity: 0.85,
+                footprint: 1.1,
                 neighbours: 1.0,
-                thickness: 1.0,
+                thickness: 0.5,
             },
             // No photo covers up to 14 % of the pixels of held-out breakfast views; all are within
             // this reach.
@@ -228,9 +206,6 @@ impl RgbOptions {
                 sh_dc: 2.5e-3,
                 sh_rest: 2.5e-3 / 20.0,
             },
-            half_res: 0.0,
-            without_ssim: 0.0,
-            decay: 1.0,
             colour_pixels: 0.0,
             losses: Losses::PHOTOS,
             virtual_views: 0,

@@ -1,11 +1,11 @@
 //! RGB stage: fits splats, initialised from points, to the photos and refines the cameras
 //! (docs/internals/method.md#splats).
 use super::bounds::Bounds;
-use super::half_res::{OwnedPhotos, Photos};
 use super::init::splats_from_points;
 use super::losses::Losses;
 use super::model::Model;
 use super::options::RgbOptions;
+use super::photos::Photos;
 use super::pose::PoseAdam;
 use super::scale::SceneScale;
 use super::schedule::ViewOrder;
@@ -217,12 +217,6 @@ pub(crate) struct Run<'a> {
     scale: SceneScale,
     photos: Photos<'a>,
     bounds: Option<Bounds>,
-    /// Photos of the first steps.
-    half_res: Option<OwnedPhotos>,
-    /// Whether the present steps leave out the SSIM term.
-    without_ssim: bool,
-    /// Views that follow the photos.
-    virtual_views: OwnedPhotos,
     poses: Vec<PoseAdam>,
     /// Losses since the last report.
     recent: Vec<StepLoss>,
@@ -258,37 +252,22 @@ impl<'a> Run<'a> {
         scale: SceneScale,
         options: &'a RgbOptions,
     ) -> Result<Self> {
-        let half_res = (half_res_steps(options) > 0).then(|| OwnedPhotos::at_half_res(&photos));
-        let first = half_res.as_ref().map_or(photos, OwnedPhotos::photos);
         let raster = RasterOptions {
             sh_degree: start.sh_degree,
             feature_mode: FeatureMode::Linear,
             features_move_geometry: true,
         };
         let losses = (&options.losses, options.min_confidence);
-        let mut views = Views::new(device, first, losses, start.len(), 0, scale.near())?;
-        let virtual_views =
-            if options.virtual_views > 0 && photos.depths.is_some() && !photos.show_emptiness() {
-                let (count, confidence) = (options.virtual_views, options.min_confidence);
-                let halved;
-                let half = match &half_res {
-                    Some(half) => half,
-                    None => {
-                        halved = OwnedPhotos::at_half_res(&photos);
-                        &halved
-                    }
-                };
-                virtual_views(&half.photos(), count, confidence, options.seed)
-            } else {
-                OwnedPhotos::default()
-            };
+        let mut views = Views::new(device, photos, losses, start.len(), 0, scale.near())?;
+        let (count, confidence) = (options.virtual_views, options.min_confidence);
+        let virtual_views = virtual_views(&photos, count, confidence, options.seed);
         if !virtual_views.images.is_empty() {
             let losses = (&Losses::VIRTUAL, options.min_confidence);
             views.add(device, virtual_views.photos(), losses, start.len(), 0)?;
         }
         let model = Model::new(device, start, 0)?;
         let order = ViewOrder::new(photos.cameras.len(), virtual_views.cameras.len(), options.seed);
-        let cameras = [first.cameras, &virtual_views.cameras].concat();
+        let cameras = [photos.cameras, &virtual_views.cameras].concat();
         let trainer = Trainer::new(device, raster, model, views, cameras, order);
         Ok(Run {
             trainer,
@@ -296,9 +275,6 @@ impl<'a> Run<'a> {
             scale,
             photos,
             bounds: options.bounded.then(|| Bounds::new(photos.cameras, &start.means)),
-            half_res,
-            without_ssim: options.without_ssim > 0.0,
-            virtual_views,
             poses: vec![PoseAdam::default(); photos.cameras.len()],
             recent: Vec::new(),
             last: (0, true),
@@ -307,33 +283,9 @@ impl<'a> Run<'a> {
         })
     }
 
-    /// Continues with the photos at full resolution; the refined poses stay.
-    fn leave_half_res(&mut self) -> Result<()> {
-        if self.half_res.take().is_none() {
-            return Ok(());
-        }
-        let t = &mut self.trainer;
-        let losses = (&self.options.losses, self.options.min_confidence);
-        let count = t.model.count();
-        t.views = Views::new(&t.device, self.photos, losses, count, 0, self.scale.near())?;
-        if !self.virtual_views.images.is_empty() {
-            let losses = (&Losses::VIRTUAL, self.options.min_confidence);
-            t.views.add(&t.device, self.virtual_views.photos(), losses, count, 0)?;
-        }
-        for (own, camera) in t.cameras.iter_mut().zip(self.photos.cameras) {
-            *own = Camera { pose: own.pose, ..camera.clone() };
-        }
-        t.forget_recordings();
-        Ok(())
-    }
-
     /// The terms of the objective for a view.
-    fn losses(&self, view: usize) -> Losses {
-        if view >= self.photos.cameras.len() {
-            return Losses::VIRTUAL;
-        }
-        let all = self.options.losses;
-        Losses { dssim: if self.without_ssim { 0.0 } else { all.dssim }, ..all }
+    fn losses(&self, view: usize) -> &Losses {
+        if view < self.photos.cameras.len() { &self.options.losses } else { &Losses::VIRTUAL }
     }
 
     /// Refines a pose; camera 0 stays, because it defines the world frame.
@@ -360,8 +312,7 @@ impl<'a> Run<'a> {
             Some(rendered) => rendered,
             None => t.views.render(photo, &t.cameras[photo], &t.model, &t.raster)?,
         };
-        let photos = self.half_res.as_ref().map_or(self.photos, OwnedPhotos::photos);
-        self.psnr[photo] = Some(photos.psnr(photo, &rendered));
+        self.psnr[photo] = Some(self.photos.psnr(photo, &rendered));
         let known: Vec<f64> = self.psnr.iter().flatten().copied().collect();
         let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
         let losses: Vec<f64> = self.recent.iter().map(|l| l.total).collect();
@@ -411,7 +362,6 @@ impl<'a> Run<'a> {
     /// Copies the results to the host and keeps the refined cameras only if they explain the photos
     /// better.
     fn finish(&mut self) -> Result<(Splats, Vec<Camera>, Vec<f64>, bool)> {
-        self.leave_half_res()?;
         self.clamp_to_bounds()?;
         let (t, photos) = (&mut self.trainer, self.photos);
         let initial = photos.cameras;
@@ -448,18 +398,9 @@ impl Training for Run<'_> {
     }
 
     fn schedule(&mut self, iteration: usize) -> Result<()> {
-        if iteration >= half_res_steps(self.options) {
-            self.leave_half_res()?;
-        }
-        let share = iteration as f64 / self.options.iterations.max(1) as f64;
-        if self.without_ssim && share >= self.options.without_ssim {
-            self.without_ssim = false;
-            self.trainer.forget_recordings();
-        }
         let size = self.photos.images.first().map_or(1, |i| i.data.len());
         self.trainer.model.hold_colours_below(self.options.colour_pixels, size);
-        let rates = self.options.rates.scaled(self.options.decay.powf(share));
-        self.trainer.model.set_rates(&rates, 0.0, self.scale.extent, iteration)
+        self.trainer.model.set_rates(&self.options.rates, 0.0, self.scale.extent, iteration)
     }
 
     fn record(&self, view: usize) -> Recorder {
@@ -528,9 +469,4 @@ impl Training for Run<'_> {
         (self.poses, self.recent, self.last) = (kept.poses, kept.recent, kept.last);
         (self.psnr, self.curve) = (kept.psnr, kept.curve);
     }
-}
-
-/// Number of first steps with the photos at half resolution.
-fn half_res_steps(options: &RgbOptions) -> usize {
-    (options.half_res * options.iterations as f64) as usize
 }

@@ -359,7 +359,6 @@ mod tests {
                 prune_from: COUNTED,
                 prune_every: COUNTED,
                 losses: Losses { needles: Some(0.1), ..Losses::PHOTOS },
-                half_res: 0.0,
                 ..colour_options()
             };
             let scale = SceneScale::measure(&cameras, &start.means);

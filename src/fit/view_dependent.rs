@@ -1,8 +1,8 @@
 //! View-dependent colour (docs/internals/method.md#view-dependent-colour): spherical harmonics on a
 //! trained geometry, of the degree that left-out photos support.
-use super::half_res::Photos;
 use super::losses::Losses;
 use super::options::{Rates, RgbOptions};
+use super::photos::Photos;
 use super::rgb::{Trained, fit_photos};
 use super::scale::SceneScale;
 use super::sh_degree::{DegreeTrial, ViewDependence};
@@ -115,7 +115,6 @@ impl Fit<'_> {
             iterations,
             seed: self.options.seed,
             rates: Rates { sh_dc: self.options.rates[0], sh_rest: self.options.rates[1], ..Rates::STILL },
-            half_res: 0.0,
             virtual_views: 0,
             losses: Losses::PHOTOS,
             bounded: false,

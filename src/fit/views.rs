@@ -9,9 +9,9 @@ use crate::pass::{FrameBuffers, RasterOptions, Rasterizer};
 use crate::scene::{Camera, DepthMap, Outside, RgbImage};
 use crate::{Error, Result};
 
-use super::half_res::Photos;
 use super::losses::Losses;
 use super::model::Model;
+use super::photos::Photos;
 
 /// One training view.
 pub(super) struct TrainView {

@@ -3,7 +3,7 @@
 //!
 //! A few photos leave splats free along the rays: from the side, surfaces open and splats that one
 //! photo alone supports stand in the way. Warped photos show how the surfaces look from there.
-use super::half_res::{OwnedPhotos, Photos};
+use super::photos::{OwnedPhotos, Photos};
 use crate::math::Random;
 use crate::scene::{Camera, CameraOrbit, Coverage, DepthMap, Image, Outside, RgbImage};
 use glam::{DVec2, DVec3};
@@ -19,10 +19,14 @@ const AZIMUTH: [f64; 2] = [4.0, 22.0];
 const ELEVATION: [f64; 2] = [-12.0, 16.0];
 const DISTANCE: [f64; 2] = [0.8, 1.25];
 
-/// Warps photos to `count` cameras around them, at their size. Pixels that no photo shows without
-/// contradiction are not used. Empty without depth.
+/// Warps photos to `count` cameras around them, at half their size. Pixels that no photo shows
+/// without contradiction are not used. Empty without depth, and with an empty background.
 pub(super) fn virtual_views(photos: &Photos, count: usize, min_confidence: f32, seed: u64) -> OwnedPhotos {
-    warped_views(photos, count, ELEVATION, min_confidence, seed)
+    if count == 0 || photos.depths.is_none() || photos.show_emptiness() {
+        return OwnedPhotos::default();
+    }
+    let half = OwnedPhotos::at_half_res(photos);
+    warped_views(&half.photos(), count, ELEVATION, min_confidence, seed)
 }
 
 fn warped_views(

@@ -157,7 +157,6 @@ impl Reconstruction<'_> {
             photos: photos.len(),
             pixels: photos.iter().map(|p| p.image.width * p.image.height).sum(),
             steps: training.iterations,
-            half_res: training.half_res,
             language: config.language.is_some(),
             built_in: networks.is_empty(),
         });

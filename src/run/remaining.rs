@@ -10,7 +10,7 @@ const TYPICAL_PIXELS: f64 = 640.0 * 480.0;
 /// Number of these photos.
 const TYPICAL_PHOTOS: f64 = 4.0;
 /// Training steps that the typical seconds are of.
-const TYPICAL_STEPS: f64 = 400.0;
+const TYPICAL_STEPS: f64 = 150.0;
 /// Typical seconds that the pace of the machine is at first assumed for. They keep the noise of the
 /// first short stages out of the estimate.
 const PRIOR: f64 = 5.0;
@@ -19,8 +19,6 @@ const OWN_PACE: f64 = 0.25;
 /// Share of the time of dense stereo that its first tenth takes beyond its part: coarse levels wait
 /// for the device, and the processor finds edges beside.
 const STEREO_START: f64 = 0.2;
-/// Cost of a training step at full resolution, in steps at half of it.
-const FULL_RES: f64 = 1.45;
 
 /// A stage of the first lane, for which all later ones wait.
 struct Part {
@@ -39,8 +37,6 @@ pub(super) struct Work {
     pub(super) pixels: usize,
     /// Training steps.
     pub(super) steps: usize,
-    /// Share of the training steps at half resolution.
-    pub(super) half_res: f64,
     /// Whether the scene gets language.
     pub(super) language: bool,
     /// Whether built-in methods do all of the work. The time of networks is not known before.
@@ -59,13 +55,13 @@ fn parts(work: &Work) -> Vec<Part> {
         ("features", 0.3, 0.1, photos),
         // Pairs of photos.
         ("cameras", 6.0, 2.5, photos * photos),
-        ("dense stereo", 60.0, 0.3, pixels),
+        ("dense stereo", 26.0, 0.3, pixels),
         ("surfaces", 3.0, 1.1, pixels),
         ("initial splats", 1.5, 0.4, pixels),
-        ("splats", 110.0, 0.8, steps),
+        ("splats", 75.0, 0.3, steps),
         // Half of the time on photos of shiny things; matt ones skip it.
         ("view dependence", 6.0, 0.2, pixels * view_dependence),
-        ("language", 8.0, 0.4, pixels),
+        ("language", 2.0, 0.4, pixels),
         ("decode", 5.0, 0.3, pixels),
         ("query", 0.5, 0.2, 1.0),
         ("seen", 1.0, 0.1, pixels),
@@ -82,7 +78,6 @@ fn parts(work: &Work) -> Vec<Part> {
 #[derive(Default)]
 struct Course {
     parts: Vec<Part>,
-    half_res: f64,
     built_in: bool,
     /// Index of the current or last stage.
     at: usize,
@@ -113,10 +108,6 @@ impl Course {
     /// Share of the time of a stage that this share of its steps takes.
     fn time_share(&self, stage: &str, steps: f64) -> f64 {
         match stage {
-            "splats" => {
-                let cost = |x: f64| x.min(self.half_res) + FULL_RES * (x - self.half_res).max(0.0);
-                cost(steps) / cost(1.0)
-            }
             "dense stereo" => STEREO_START * (10.0 * steps).min(1.0) + (1.0 - STEREO_START) * steps,
             _ => steps,
         }
@@ -170,7 +161,7 @@ impl<'a> WithRemaining<'a> {
     /// The size of the work is known from here on.
     pub(super) fn plan(&self, work: &Work) {
         let course = &mut lock(&self.course).0;
-        (course.parts, course.half_res, course.built_in) = (parts(work), work.half_res, work.built_in);
+        (course.parts, course.built_in) = (parts(work), work.built_in);
     }
 
     fn tell(&self, change: impl FnOnce(&mut (Course, u64), f64)) {
@@ -223,19 +214,11 @@ mod tests {
     use super::*;
 
     fn work() -> Work {
-        Work {
-            on_cpu: true,
-            photos: 4,
-            pixels: 4 * 640 * 480,
-            steps: 400,
-            half_res: 0.6,
-            language: true,
-            built_in: true,
-        }
+        Work { on_cpu: true, photos: 4, pixels: 4 * 640 * 480, steps: 120, language: true, built_in: true }
     }
 
     fn course(work: &Work) -> Course {
-        Course { parts: parts(work), half_res: work.half_res, built_in: work.built_in, ..Course::default() }
+        Course { parts: parts(work), built_in: work.built_in, ..Course::default() }
     }
 
     /// A stage: begin, seconds, and finished (share of the steps, seconds).

@@ -210,7 +210,7 @@ pub struct CurveArgs {
     /// Folders with ground_truth.json, photos and masks
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     pub data: Vec<PathBuf>,
-    /// Trainings to compare, each the preset with some options changed, as steps=200,half-res=0.5;
+    /// Trainings to compare, each the preset with some options changed, as steps=200,opacity=0.5;
     /// `preset` changes none [default: preset]
     #[arg(long, value_name = "NAME=VALUE,...", num_args = 1..)]
     pub variant: Vec<Variant>,

@@ -17,9 +17,6 @@ type Change = fn(&mut RgbOptions, f64);
 /// Options that a variant may change.
 const OPTIONS: &[(&str, Change)] = &[
     ("steps", |o, v| *o = o.clone().with_iterations(v as usize)),
-    ("half-res", |o, v| o.half_res = v),
-    ("without-ssim", |o, v| o.without_ssim = v),
-    ("decay", |o, v| o.decay = v),
     ("points", |o, v| o.init.max_points = v as usize),
     ("opacity", |o, v| o.init.opacity = v as f32),
     ("footprint", |o, v| o.init.footprint = v as f32),
@@ -94,13 +91,13 @@ mod tests {
     #[test]
     fn changes_apply_in_order_and_unknown_names_fail() {
         let options = || RgbOptions::preset(Preset::Draft);
-        let variant: Variant = "steps=50,half-res=0,rates=2".parse().unwrap();
+        let variant: Variant = "steps=50,opacity=0.5,rates=2".parse().unwrap();
         let changed = variant.applied(options()).unwrap();
-        assert_eq!((changed.iterations, changed.half_res), (50, 0.0));
+        assert_eq!((changed.iterations, changed.init.opacity), (50, 0.5));
         assert!((changed.rates.quats / options().rates.quats - 2.0).abs() < 1e-12);
         assert_eq!("preset".parse::<Variant>().unwrap().applied(options()).unwrap(), options());
         assert!("steps".parse::<Variant>().is_err());
-        for wrong in ["stops=3", "steps=many", "half-res=-1"] {
+        for wrong in ["stops=3", "steps=many", "opacity=-1"] {
             assert!(wrong.parse::<Variant>().unwrap().applied(options()).is_err(), "{wrong}");
         }
     }

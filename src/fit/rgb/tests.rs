@@ -1,8 +1,6 @@
 //! Tests of [`super`].
 use super::*;
 use crate::fit::losses::Losses;
-use crate::fit::pose::PoseOptions;
-use crate::fit::schedule::Exponential;
 use crate::gpu::test_device;
 use crate::pass::Renderer;
 use crate::preset::Preset;
@@ -24,30 +22,10 @@ fn scene(device: &Device) -> (Splats, Vec<Camera>, Vec<RgbImage>) {
 }
 
 #[test]
-fn full_resolution_steps_keep_refined_poses() {
-    let device = test_device();
-    let (splats, cameras, images) = scene(&device);
-    let poses = Some(PoseOptions { start: 0, rate: Exponential::constant(1e-3) });
-    let options = RgbOptions { iterations: 10, half_res: 0.5, poses, ..RgbOptions::preset(Preset::Draft) };
-    let scale = SceneScale::measure(&cameras, &splats.means);
-    let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
-    let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
-    let size = |run: &Run| {
-        let frame = run.trainer.step_resources().raster.frame();
-        [frame.width, frame.height, run.trainer.cameras[1].width]
-    };
-    (0..5).for_each(|iteration| run.step(iteration).unwrap());
-    let found = run.trainer.cameras[1].pose;
-    assert!(size(&run) == [38, 27, 38] && found != cameras[1].pose, "{:?} {found:?}", size(&run));
-    run.schedule(5).unwrap();
-    assert_eq!((size(&run), run.trainer.cameras[1].pose), ([75, 53, 75], found));
-}
-
-#[test]
 fn worse_refined_cameras_are_discarded() {
     let device = test_device();
     let (splats, cameras, images) = scene(&device);
-    let options = RgbOptions { half_res: 0.0, bounded: false, ..RgbOptions::preset(Preset::Draft) };
+    let options = RgbOptions { bounded: false, ..RgbOptions::preset(Preset::Draft) };
     let scale = SceneScale::measure(&cameras, &splats.means);
     let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
     let mut run = Run::new(&device, photos, &splats, scale, &options).unwrap();
@@ -78,8 +56,7 @@ fn each_loss_trains_its_own_target() {
     let off = Losses { l1: 0.0, dssim: 0.0, ..Losses::PHOTOS };
     let trained = |losses| {
         let preset = RgbOptions::preset(Preset::Draft);
-        let options =
-            RgbOptions { losses, iterations: 10, half_res: 0.0, poses: None, bounded: false, ..preset };
+        let options = RgbOptions { losses, iterations: 10, poses: None, bounded: false, ..preset };
         let options = RgbOptions { prune_every: 0, ..options };
         fit_photos(&device, photos, start.clone(), scale, &options, &crate::progress::Silent).unwrap().splats
     };
@@ -126,7 +103,6 @@ fn unused_pixels_do_not_train_splats() {
     let coverage: Vec<_> = cameras.iter().map(|_| Some(left_half(75, 53, Outside::Unknown))).collect();
     let options = RgbOptions {
         iterations: 12,
-        half_res: 0.5,
         poses: None,
         bounded: false,
         prune_every: 0,

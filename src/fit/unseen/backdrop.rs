@@ -1,7 +1,7 @@
 //! A sphere behind the scene in the blurred colours of what is farthest in each direction. It fills
 //! directions in which neither a photo nor a continued surface shows anything, and fades away from
 //! those the photos look in.
-use crate::fit::half_res::Photos;
+use crate::fit::photos::Photos;
 use crate::math::{quantile, sphere_directions};
 use crate::scene::{SH_C0, Splats};
 use glam::{DMat3, DQuat, DVec2, DVec3};

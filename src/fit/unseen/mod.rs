@@ -12,8 +12,8 @@ use crate::math::Random;
 use crate::scene::{Camera, DepthMap, RgbImage, SH_C0, Splats};
 pub(super) use backdrop::backdrop;
 
-use super::half_res::Photos;
 use super::options::RgbOptions;
+use super::photos::Photos;
 use super::virtual_views::views_beside;
 use anchor::{Anchor, BEHIND, STEP, Shown};
 use glam::{DMat3, DQuat, DVec2, DVec3};

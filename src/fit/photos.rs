@@ -1,5 +1,4 @@
-//! Photos at half their resolution for the first training steps: a step costs less than half there,
-//! and the coarse structure is fitted first.
+//! Photos as training takes them, also at half their resolution.
 use crate::scene::{Camera, Coverage, DepthMap, Image, RgbImage};
 
 /// Inputs of training: photos with cameras, depth and coverage.
