@@ -29,9 +29,7 @@ layout(push_constant) uniform Push {
 const int SLOTS = 2;
 
 #define CHANNELS BASE_CHANNELS
-#define SHARED_SPLATS 0
-#include "shared/raster.glsl"
-#define HALF (SUBGROUP_SIZE / 2)
+#include "shared/raster_shuffled.glsl"
 
 float T[PIXELS], part[SLOTS];
 int slot[PIXELS];

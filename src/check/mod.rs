@@ -53,6 +53,7 @@ const CASES: &[Case] = &[
         render::forward(d, TileBinning::Sorting)
     }),
     case("tile lists", Some(KernelVariant::SortedLists), render::sorted_lists),
+    case("blending weights by label", None, render::label_weights),
     case("gradients", Some(KernelVariant::StoredGradients), |d| {
         render::backward(d, GradientReduction::Entries)
     }),

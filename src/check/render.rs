@@ -5,8 +5,9 @@ use crate::math::Random;
 use crate::pass::adam::{BETA, EPSILON, Moments, Schedule, adam};
 use crate::pass::close::{IMAGE, Tolerance, gradient_tolerance};
 use crate::pass::fused_update::{self, ROWS, SplatAdam, flat};
+use crate::pass::label_weights::{self, LabelWeights};
 use crate::pass::params::Params;
-use crate::pass::raster_forward::Cutoffs;
+use crate::pass::raster_forward::{Cutoffs, ReferenceScene};
 use crate::pass::reference::{self, Forward};
 use crate::pass::{
     DeviceChoices, FeatureMode, GradientReduction, RasterOptions, Rasterizer, ShGradientKernel, SplatBuffers,
@@ -71,6 +72,29 @@ pub(super) fn forward(device: &Device, grouping: TileBinning) -> Found {
         close("planes", &planes, &reference.image.planes, &IMAGE),
         close("transmittance", &rest, &reference.image.transmittance, &IMAGE),
     ]))
+}
+
+/// Blending weights by label: two levels, of which one leaves pixels without a label.
+pub(super) fn label_weights(device: &Device) -> Found {
+    let scene = Scene::new(FEATURES);
+    let (params, mut raster) = scene.rendered(device, DeviceChoices::of(device))?;
+    let pixels = (0..SIZE[0] * SIZE[1]).map(|p| [(p % SIZE[0]) as i32, (p / SIZE[0]) as i32]);
+    let stripes = pixels.clone().map(|[x, y]| (x + y) / 5 % 4);
+    let columns = pixels.map(|[x, _]| if x / 3 % 5 == 0 { -1 } else { 4 + x / 3 % 2 });
+    let labels: Vec<i32> = stripes.chain(columns).collect();
+    let mut sums = LabelWeights::new(scene.splats.len());
+    raster.add_label_weights(&params, &scene.options, &labels, &mut sums)?;
+    let forward = scene.reference();
+    let reference = ReferenceScene {
+        projected: &forward.projected,
+        features: &[],
+        feature_dim: 0,
+        order: &forward.order,
+        view: &scene.view,
+    };
+    let difference = sums.difference(&label_weights::reference(&reference, &labels));
+    let text = format!("{difference:.1e} of the weights differ");
+    Ok(if difference < 1e-3 { Ok(text) } else { Err(text) })
 }
 
 /// Compares the tile lists by sorting with those by counters, of more splats than one chunk has and

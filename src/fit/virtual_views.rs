@@ -358,7 +358,9 @@ mod tests {
         let views = virtual_views(&photos, 6, 0.5, 3);
         assert_eq!((views.images.len(), views.cameras.len(), views.coverage.len()), (6, 6, 6));
         for (camera, coverage) in views.cameras.iter().zip(&views.coverage) {
-            let share = coverage.as_ref().unwrap().share.data.iter().sum::<f32>() / (WIDTH * HEIGHT) as f32;
+            let used = &coverage.as_ref().unwrap().share;
+            assert_eq!([used.width, used.height], [WIDTH / 2, HEIGHT / 2]);
+            let share = used.data.iter().sum::<f32>() / used.data.len() as f32;
             assert!(share > 0.3, "{share}");
             let away = camera.pose.centre().distance(DVec3::ZERO);
             assert!(away > 0.1 && away < 2.0, "{away}");

@@ -1,6 +1,6 @@
 //! Options of a device from the environment.
 use super::{KernelVariant, folder::FolderCache};
-use crate::Error;
+use crate::{Error, native};
 use splatvk_gpu::{Cache, Device, Options};
 use std::sync::Arc;
 
@@ -19,7 +19,9 @@ pub fn open(choice: Option<&str>) -> crate::Result<Device> {
 /// Those of [`open`].
 pub fn open_with(options: &Options) -> crate::Result<Device> {
     check_disabled(options)?;
-    Ok(Device::open(options)?)
+    let natives =
+        if options.disabled.contains(KernelVariant::NativePasses.name()) { &[] } else { native::ALL };
+    Ok(Device::open(&Options { natives, ..options.clone() })?)
 }
 
 fn check_disabled(options: &Options) -> crate::Result<()> {

@@ -42,11 +42,15 @@ pub enum KernelVariant {
     HostSweep,
     /// Plane sweep of stereo by shaders ([`crate::pass::plane_sweep`]).
     DeviceSweep,
+    /// Native code in place of shaders where the device is the processor ([`crate::native`]).
+    NativePasses,
+    /// Shaders everywhere.
+    ShaderPasses,
 }
 
 impl KernelVariant {
     /// All of them.
-    pub const ALL: [KernelVariant; 17] = [
+    pub const ALL: [KernelVariant; 19] = [
         KernelVariant::FloatAtomics,
         KernelVariant::AtomicGradients,
         KernelVariant::StoredGradients,
@@ -64,6 +68,8 @@ impl KernelVariant {
         KernelVariant::FusedUpdate,
         KernelVariant::HostSweep,
         KernelVariant::DeviceSweep,
+        KernelVariant::NativePasses,
+        KernelVariant::ShaderPasses,
     ];
 
     /// The name that `splatvk doctor` prints and [`crate::gpu::Options::disabled`] takes.
@@ -86,6 +92,8 @@ impl KernelVariant {
             KernelVariant::FusedUpdate => "update in one pass",
             KernelVariant::HostSweep => "plane sweep on the host",
             KernelVariant::DeviceSweep => "plane sweep on the device",
+            KernelVariant::NativePasses => "native passes",
+            KernelVariant::ShaderPasses => "shader passes",
         }
     }
 
@@ -109,6 +117,8 @@ impl KernelVariant {
             KernelVariant::FusedUpdate => KernelVariant::SeparateUpdate,
             KernelVariant::HostSweep => KernelVariant::DeviceSweep,
             KernelVariant::DeviceSweep => KernelVariant::HostSweep,
+            KernelVariant::NativePasses => KernelVariant::ShaderPasses,
+            KernelVariant::ShaderPasses => KernelVariant::NativePasses,
         }
     }
 

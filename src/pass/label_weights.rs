@@ -237,7 +237,7 @@ mod tests {
     use crate::pass::{FeatureMode, RasterOptions, Rasterizer, SplatBuffers, View};
     use crate::scene::{Camera, Splats, seeded};
 
-    const SIZE: [usize; 2] = [75, 93];
+    const SIZE: [usize; 2] = [75, 173];
 
     /// Two levels: stripes of five pixels that are labels 0 to 3, and columns that are 4 to 11 or
     /// none. Tiles show up to six sets.
@@ -280,8 +280,9 @@ mod tests {
         // f32 and f64 may disagree at the two thresholds for a pair in ten thousand.
         let difference = whole.difference(&expected);
         assert!(difference < 1e-3, "{difference}");
-        let small = Options { max_binding: Some(128 << 10), ..crate::gpu::options(None) };
+        let small = Options { max_binding: Some(256 << 10), ..crate::gpu::options(None) };
         let (in_bands, bands) = sums(&TestDevice::open(&small).unwrap(), &splats, &camera);
-        assert!(bands > 1 && in_bands == whole, "{bands} bands");
+        let difference = in_bands.difference(&expected);
+        assert!(bands > 1 && difference < 1e-3, "{bands} bands: {difference}");
     }
 }

@@ -91,6 +91,7 @@ impl Device {
             queue_lock: host.queue_lock,
             owned: false,
             cache: None,
+            natives: &[],
         };
         Device::assemble(entry, candidate.physical, None, setup)
     }

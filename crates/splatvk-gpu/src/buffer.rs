@@ -8,7 +8,7 @@ use bytemuck::Pod;
 use std::marker::PhantomData;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, OnceLock};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
 /// A storage buffer of `T` in device memory. Clones share it; it lives as long as any clone, or any
 /// program that uses it.
@@ -242,6 +242,24 @@ impl<T: Pod> Buffer<T> {
         }
         self.set_fetched(false);
         self.0.device.staged_write(self.raw(), range.start, bytes)
+    }
+}
+
+/// The mapped memory of a buffer, which nothing else uses meanwhile.
+pub(crate) struct Mapped<'a>(MutexGuard<'a, Option<Block>>);
+
+impl Mapped<'_> {
+    /// All bytes, also the padding.
+    pub fn bytes_mut(&mut self) -> &mut [u8] {
+        self.0.as_mut().and_then(Block::bytes_mut).unwrap_or_default()
+    }
+}
+
+impl Buffer {
+    /// The memory, if it is mapped.
+    pub(crate) fn mapped(&self) -> Option<Mapped<'_>> {
+        let block = lock(&self.0.block);
+        block.as_ref().is_some_and(|b| b.bytes().is_some()).then_some(Mapped(block))
     }
 }
 

@@ -7,6 +7,7 @@ use crate::executor::Executor;
 use crate::info::DeviceInfo;
 use crate::memory::{Heap, Memory};
 use crate::module::Module;
+use crate::native::Native;
 use crate::pipeline::Pipeline;
 use crate::staging::Staging;
 use crate::sync::lock;
@@ -32,6 +33,7 @@ pub(crate) struct Setup {
     pub queue_lock: Option<QueueLock>,
     pub owned: bool,
     pub cache: Option<Arc<dyn Cache>>,
+    pub natives: &'static [Native],
 }
 
 /// A Vulkan device; clones share it.
@@ -53,6 +55,8 @@ pub(crate) struct Inner {
     submissions: AtomicU64,
     /// Runs programs instead of the queue, in tests.
     pub stand_in: Option<Box<dyn Executor>>,
+    /// Native code in place of shaders.
+    pub natives: &'static [Native],
     /// The submission from which on the device is lost.
     #[cfg(feature = "testing")]
     lost_from: AtomicU64,
@@ -112,6 +116,8 @@ impl Device {
                 return Err(e);
             }
         };
+        // Native code works on mapped buffers, and is faster where the device is the processor.
+        let on_processor = info.is_cpu && info.mapped;
         let messenger = sink.as_ref().and_then(|sink| {
             let debug = ash::ext::debug_utils::Instance::new(&entry, &instance);
             // SAFETY: the sink outlives the messenger (see Drop).
@@ -129,6 +135,7 @@ impl Device {
             heap,
             submissions: AtomicU64::new(0),
             stand_in: None,
+            natives: if on_processor { setup.natives } else { &[] },
             #[cfg(feature = "testing")]
             lost_from: AtomicU64::new(u64::MAX),
             staging: Mutex::default(),

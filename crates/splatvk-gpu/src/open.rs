@@ -55,6 +55,7 @@ impl Device {
             queue_lock: None,
             owned: true,
             cache: options.cache,
+            natives: options.natives,
         };
         Self::assemble(entry, physical, sink, setup)
     }

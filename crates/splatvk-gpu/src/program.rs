@@ -8,11 +8,14 @@ use crate::error::vk_error;
 use crate::executor::Executor;
 use crate::hazard::{self, Barrier, Step};
 use crate::module::Module;
+use crate::native;
 use crate::sync::lock;
 use crate::{Error, Result};
 use ash::vk;
 use std::collections::HashMap;
+use std::ops::Range;
 use std::sync::Mutex;
+use std::time::Instant;
 
 /// A recording ready to run, any number of times. It keeps its buffers alive.
 pub struct Program {
@@ -31,9 +34,18 @@ struct Raw {
     descriptors: vk::DescriptorPool,
     sets: Vec<vk::DescriptorSet>,
     fence: vk::Fence,
-    plain: vk::CommandBuffer,
+    plain: Vec<Segment>,
     /// With timestamps; encoded when first asked for.
-    timed: Option<(vk::CommandBuffer, vk::QueryPool)>,
+    timed: Option<(Vec<Segment>, vk::QueryPool)>,
+}
+
+/// Commands that run one after the other in one place.
+#[derive(Clone)]
+enum Segment {
+    /// On the device, one submission.
+    Device(vk::CommandBuffer),
+    /// In native code.
+    Native(Range<usize>),
 }
 
 impl Program {
@@ -64,7 +76,7 @@ impl Program {
             descriptors: vk::DescriptorPool::null(),
             sets: Vec::new(),
             fence: vk::Fence::null(),
-            plain: vk::CommandBuffer::null(),
+            plain: Vec::new(),
             timed: None,
         };
         let results = results(&commands);
@@ -79,7 +91,7 @@ impl Program {
     /// Submits and waits.
     pub fn run(&self) -> Result<()> {
         let raw = lock(&self.raw);
-        self.submit(raw.plain, raw.fence)
+        self.submit(&raw.plain, raw.fence, &mut |_, _| ())
     }
 
     /// The executor that replaces the device, in tests.
@@ -87,15 +99,71 @@ impl Program {
         self.device.0.stand_in.as_deref()
     }
 
-    fn submit(&self, commands: vk::CommandBuffer, fence: vk::Fence) -> Result<()> {
+    /// Runs all segments; `native` receives each command of native code with its milliseconds.
+    fn submit(
+        &self,
+        segments: &[Segment],
+        fence: vk::Fence,
+        native: &mut dyn FnMut(usize, f64),
+    ) -> Result<()> {
         if let Some(executor) = self.executor() {
             let commands: Vec<&Op> = self.commands.iter().map(|c| &c.op).collect();
             return executor.run(&commands).map_err(|e| Error::refused(format!("{}: {e}", self.label)));
         }
         self.results.iter().for_each(|(buffer, _)| buffer.set_fetched(false));
-        self.device.submit(commands, fence, &self.label)?;
+        for segment in segments {
+            match segment {
+                Segment::Device(commands) => self.device.submit(*commands, fence, &self.label)?,
+                Segment::Native(range) => {
+                    for index in range.clone() {
+                        let clock = Instant::now();
+                        native::run(self.device.0.natives, &self.commands[index].op, &self.label)?;
+                        native(index, 1e3 * clock.elapsed().as_secs_f64());
+                    }
+                }
+            }
+        }
         self.results.iter().for_each(|(buffer, fetched)| buffer.set_fetched(*fetched));
         Ok(())
+    }
+
+    /// Divides the commands by where they run: whether in native code, and which. Fills and copies run
+    /// where the command before them does, since a change of place is a submission more.
+    fn places(&self) -> Vec<(bool, Range<usize>)> {
+        let natives = self.device.0.natives;
+        let is_native = |command: &Command| match &command.op {
+            Op::Dispatch { call, .. } => Some(native::find(natives, call.family.name).is_some()),
+            Op::Fill { .. } | Op::Copy { .. } => None,
+        };
+        let mut current = self.commands.iter().find_map(is_native).unwrap_or(false);
+        let mut places: Vec<(bool, Range<usize>)> = Vec::new();
+        for (index, command) in self.commands.iter().enumerate() {
+            current = is_native(command).unwrap_or(current);
+            match places.last_mut().filter(|p| p.0 == current) {
+                Some((_, range)) => range.end = index + 1,
+                None => places.push((current, index..index + 1)),
+            }
+        }
+        places
+    }
+
+    /// Records the segments, with timestamps into `queries`.
+    fn segments(&self, raw: &Raw, queries: Option<vk::QueryPool>) -> Result<Vec<Segment>> {
+        let count = (2 * self.commands.len()).max(1) as u32;
+        let mut first = true;
+        let record = |(is_native, range): (bool, Range<usize>)| {
+            if is_native {
+                return Ok(Segment::Native(range));
+            }
+            let commands = self.begin(raw)?;
+            if let Some(pool) = queries.filter(|_| std::mem::take(&mut first)) {
+                // SAFETY: recording; the pool has `count` queries.
+                unsafe { self.device.0.device.cmd_reset_query_pool(commands, pool, 0, count) };
+            }
+            self.encode(raw, commands, &range, queries)?;
+            Ok(Segment::Device(commands))
+        };
+        self.places().into_iter().map(record).collect()
     }
 
     /// Submits and waits; milliseconds per command, in order.
@@ -105,24 +173,33 @@ impl Program {
             return Err(Error::refused(format!("{} has no timestamps", self.device.info().name)));
         }
         let mut raw = lock(&self.raw);
-        let (commands, pool) = match raw.timed {
-            Some(timed) => timed,
+        let (segments, pool) = match &raw.timed {
+            Some(timed) => timed.clone(),
             None => {
                 let timed = self.encode_timed(&raw)?;
-                raw.timed = Some(timed);
+                raw.timed = Some(timed.clone());
                 timed
             }
         };
-        self.submit(commands, raw.fence)?;
-        let mut ticks = vec![0u64; 2 * self.commands.len()];
-        if !ticks.is_empty() {
-            let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
-            // SAFETY: the pool has two queries per command, all written by the finished submit.
-            unsafe { self.device.0.device.get_query_pool_results(pool, 0, &mut ticks, flags) }
-                .map_err(vk_error(&self.label))?;
+        let mut times = vec![0.0; self.commands.len()];
+        self.submit(&segments, raw.fence, &mut |index, ms| times[index] = ms)?;
+        let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
+        for (is_native, range) in self.places() {
+            if is_native {
+                continue;
+            }
+            let mut ticks = vec![0u64; 2 * range.len()];
+            // SAFETY: the pool has two queries per command; those of the range are written by the
+            // finished submit.
+            unsafe {
+                let first = 2 * range.start as u32;
+                self.device.0.device.get_query_pool_results(pool, first, &mut ticks, flags)
+            }
+            .map_err(vk_error(&self.label))?;
+            let ms = |pair: &[u64]| pair[1].saturating_sub(pair[0]) as f64 * period / 1e6;
+            times[range].iter_mut().zip(ticks.chunks_exact(2)).for_each(|(time, pair)| *time = ms(pair));
         }
-        let ms = |pair: &[u64]| pair[1].saturating_sub(pair[0]) as f64 * period / 1e6;
-        Ok(self.commands.iter().zip(ticks.chunks_exact(2)).map(|(c, t)| (c.label.clone(), ms(t))).collect())
+        Ok(self.commands.iter().zip(times).map(|(c, ms)| (c.label.clone(), ms)).collect())
     }
 
     /// The pass of each command (see [`crate::Recorder::pass`]), in order.
@@ -147,8 +224,8 @@ impl Program {
                 device.create_fence(&vk::FenceCreateInfo::default(), None).map_err(vk_error(&self.label))?;
         }
         self.descriptors(&mut raw)?;
-        raw.plain = self.begin(&raw)?;
-        self.encode(&raw, raw.plain, None)
+        raw.plain = self.segments(&raw, None)?;
+        Ok(())
     }
 
     fn begin(&self, raw: &Raw) -> Result<vk::CommandBuffer> {
@@ -175,6 +252,11 @@ impl Program {
                 by_command.push(None);
                 continue;
             };
+            // Native code needs no descriptors, and no pipeline.
+            if native::find(self.device.0.natives, call.family.name).is_some() {
+                by_command.push(None);
+                continue;
+            }
             let key = (module.name, call.buffers.iter().map(|(_, b)| b.id()).collect());
             let slot = *index.entry(key).or_insert_with(|| {
                 distinct.push((module, call));
@@ -238,27 +320,26 @@ impl Program {
         Ok(set)
     }
 
-    fn encode_timed(&self, raw: &Raw) -> Result<(vk::CommandBuffer, vk::QueryPool)> {
+    fn encode_timed(&self, raw: &Raw) -> Result<(Vec<Segment>, vk::QueryPool)> {
         let device = &self.device.0.device;
         let count = (2 * self.commands.len()).max(1) as u32;
         let info = vk::QueryPoolCreateInfo::default().query_type(vk::QueryType::TIMESTAMP).query_count(count);
         // SAFETY: plain object creation on a live device.
         let queries = unsafe { device.create_query_pool(&info, None) }.map_err(vk_error(&self.label))?;
-        let encode = || {
-            let commands = self.begin(raw)?;
-            // SAFETY: recording; the pool has `count` queries.
-            unsafe { device.cmd_reset_query_pool(commands, queries, 0, count) };
-            self.encode(raw, commands, Some(queries))?;
-            Ok(commands)
-        };
-        encode().map(|commands| (commands, queries)).inspect_err(|_| {
+        self.segments(raw, Some(queries)).map(|segments| (segments, queries)).inspect_err(|_| {
             // SAFETY: never submitted.
             unsafe { device.destroy_query_pool(queries, None) }
         })
     }
 
-    /// Records all steps into a command buffer that has begun, and ends it.
-    fn encode(&self, raw: &Raw, out: vk::CommandBuffer, queries: Option<vk::QueryPool>) -> Result<()> {
+    /// Records the steps of a range of commands into a command buffer that has begun, and ends it.
+    fn encode(
+        &self,
+        raw: &Raw,
+        out: vk::CommandBuffer,
+        range: &Range<usize>,
+        queries: Option<vk::QueryPool>,
+    ) -> Result<()> {
         let device = &self.device.0.device;
         let stamp = |index: usize| {
             if let Some(pool) = queries {
@@ -268,14 +349,21 @@ impl Program {
             }
         };
         self.device.cmd_edge_barrier(out);
+        let mut next = 0;
         for step in &self.steps {
+            let is_inside = range.contains(&next);
             match step {
-                Step::Barriers(barriers) => self.encode_barriers(out, barriers),
+                Step::Barriers(barriers) if is_inside => self.encode_barriers(out, barriers),
                 Step::Command(index) => {
+                    next = index + 1;
+                    if !is_inside {
+                        continue;
+                    }
                     stamp(2 * index);
                     self.encode_command(out, &self.commands[*index], raw.sets[*index])?;
                     stamp(2 * index + 1);
                 }
+                Step::Barriers(_) => {}
             }
         }
         self.device.cmd_edge_barrier(out);

@@ -57,7 +57,7 @@ fn each_loss_trains_its_own_target() {
     let trained = |losses| {
         let preset = RgbOptions::preset(Preset::Draft);
         let options = RgbOptions { losses, iterations: 10, poses: None, bounded: false, ..preset };
-        let options = RgbOptions { prune_every: 0, ..options };
+        let options = RgbOptions { prune_every: 0, virtual_views: 0, ..options };
         fit_photos(&device, photos, start.clone(), scale, &options, &crate::progress::Silent).unwrap().splats
     };
     let largest_ratio = |splats: &Splats| {

@@ -1,0 +1,67 @@
+//! Native passes: the work of shaders in native code, where the device is the processor.
+//!
+//! A driver on the processor, as lavapipe, reads and writes every number of a shader's buffers by
+//! itself and takes a microsecond per barrier; native code works on rows. The shaders remain the
+//! reference of what a pass does, and tests run on them; each native pass is compared with its
+//! shader.
+mod adam;
+mod bin;
+mod project;
+mod project_backward;
+mod raster;
+mod scatter;
+mod sort;
+mod splat;
+mod ssim;
+#[cfg(test)]
+mod tests;
+
+use crate::gpu::Native;
+
+/// All native passes.
+pub static ALL: &[Native] = &[
+    Native { family: "adam", run: adam::run },
+    Native { family: "bin_base", run: bin::base },
+    Native { family: "bin_count", run: bin::count },
+    Native { family: "bin_emit", run: bin::emit },
+    Native { family: "bin_scan", run: bin::scan },
+    Native { family: "bin_scatter", run: bin::scatter },
+    Native { family: "bin_sum", run: bin::sum },
+    Native { family: "project", run: project::run },
+    Native { family: "project_backward", run: project_backward::run },
+    Native { family: "raster_backward", run: raster::backward },
+    Native { family: "raster_forward", run: raster::forward },
+    Native { family: "scan_apply", run: sort::scan_apply },
+    Native { family: "scan_lanes", run: sort::scan_lanes },
+    Native { family: "scan_sums", run: sort::scan_sums },
+    Native { family: "sort_count", run: sort::count },
+    Native { family: "sort_offsets", run: sort::offsets },
+    Native { family: "sort_scatter", run: sort::scatter },
+    Native { family: "ssim_columns", run: ssim::columns },
+    Native { family: "ssim_rows", run: ssim::rows },
+    Native { family: "ssim_gradient", run: ssim::gradient },
+];
+
+/// Defines a function whose loops use vectors of eight numbers where the processor has them.
+macro_rules! vectorised {
+    ($(#[$doc:meta])* fn $name:ident($($arg:ident: $type:ty),* $(,)?) $(-> $out:ty)? $body:block) => {
+        $(#[$doc])*
+        fn $name($($arg: $type),*) $(-> $out)? {
+            #[inline(always)]
+            fn plain($($arg: $type),*) $(-> $out)? $body
+            #[cfg(target_arch = "x86_64")]
+            {
+                #[target_feature(enable = "avx2")]
+                fn avx2($($arg: $type),*) $(-> $out)? {
+                    plain($($arg),*)
+                }
+                if std::arch::is_x86_feature_detected!("avx2") {
+                    // SAFETY: the processor has AVX2.
+                    return unsafe { avx2($($arg),*) };
+                }
+            }
+            plain($($arg),*)
+        }
+    };
+}
+pub(crate) use vectorised;

@@ -1,0 +1,148 @@
+//! Native passes against their shaders.
+use super::ALL;
+use crate::gpu::Recorder;
+use crate::gpu::{Device, Options, TestDevice};
+use crate::math::Random;
+use crate::pass::adam::{Class, Moments, Schedule};
+use crate::pass::bands::Bands;
+use crate::pass::ssim_l1::{SsimL1, SsimRowKernel};
+use crate::pass::view::View;
+use crate::pass::{RasterOptions, Rasterizer, SplatBuffers};
+use crate::scene::seeded;
+
+/// The device without native passes, and with them.
+fn devices() -> [TestDevice; 2] {
+    let options = crate::gpu::options(None);
+    [&[][..], ALL].map(|natives| TestDevice::open(&Options { natives, ..options.clone() }).unwrap())
+}
+
+/// Asserts that numbers agree up to rounding, relative to the largest.
+fn assert_close(name: &str, shader: &[f32], native: &[f32], tolerance: f32) {
+    let scale = shader.iter().fold(0.0f32, |m, v| m.max(v.abs())).max(1e-30);
+    let worst = shader.iter().zip(native).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(shader.len() == native.len() && worst <= tolerance * scale, "{name}: {worst} of {scale}");
+}
+
+fn numbers(count: usize, seed: u64) -> Vec<f32> {
+    let mut random = Random::new(seed);
+    (0..count).map(|_| random.normal() as f32).collect()
+}
+
+#[test]
+fn adam_matches_shader() {
+    // Neither a whole number of vectors nor of periods; the last gradients are not finite.
+    let (count, stride, head) = (3 * 1000 + 1, 12, 3);
+    let (values, mut gradients) = (numbers(count, 1), numbers(count, 2));
+    (gradients[7], gradients[count - 1]) = (f32::NAN, f32::INFINITY);
+    let run = |device: &Device| {
+        let parameters = device.buffer_from("parameters", &values).unwrap();
+        let by = device.buffer_from("gradients", &gradients).unwrap();
+        let guard = device.buffer_from("guard", &[0u32; 3]).unwrap();
+        let moments = Moments::new(device, count).unwrap();
+        let mut schedule = Schedule::new(device, 2).unwrap();
+        for step in 1..4 {
+            schedule.set(step, &[[0.0; 2], [0.01, 0.002]]).unwrap();
+            let mut rec = Recorder::new(device, "adam");
+            let class = Class { slot: 1, count, stride, head };
+            schedule.record(&mut rec, class, &parameters, &by, &moments, &guard);
+            rec.run().unwrap();
+        }
+        guard.write(&[0, 1, 0]).unwrap();
+        let mut rec = Recorder::new(device, "void");
+        let class = Class { slot: 1, count, stride, head };
+        schedule.record(&mut rec, class, &parameters, &by, &moments, &guard);
+        rec.run().unwrap();
+        (parameters.read().unwrap(), moments.buffer.read().unwrap(), schedule.faults().unwrap())
+    };
+    let [shader, native] = devices().map(|device| run(&device));
+    assert_close("parameters", &shader.0, &native.0, 1e-5);
+    assert_close("moments", &shader.1, &native.1, 1e-5);
+    assert_eq!((shader.2, native.2), (6, 6));
+}
+
+#[test]
+fn ssim_and_l1_match_shaders() {
+    for (width, height) in [(75, 53), (13, 7), (130, 33)] {
+        for (weighted, weights) in
+            [(false, [0.8, 0.2]), (true, [0.8, 0.2]), (false, [0.7, 0.0]), (true, [0.7, 0.0])]
+        {
+            let pixels = width * height;
+            let x: Vec<f32> = numbers(3 * pixels, 3).iter().map(|v| 0.5 + 0.2 * v).collect();
+            let noise = numbers(3 * pixels, 4);
+            let mut y: Vec<f32> = x.iter().zip(noise).map(|(x, n)| 0.8 * x + 0.05 * n).collect();
+            let covered = weighted.then(|| {
+                let of = |p: usize| [0.0f32, 1.0, 0.25][(p % width / 4 + p / width / 3) % 3];
+                let weights: Vec<f32> = (0..pixels).map(of).collect();
+                y.extend(&weights);
+                weights.iter().map(|w| f64::from(*w)).sum()
+            });
+            let run = |device: &Device| {
+                let bands = Bands::whole(width, height);
+                let pass = SsimL1::with(device, &bands, SsimRowKernel::Strips).unwrap();
+                let (x, y) = (device.buffer_from("x", &x).unwrap(), device.buffer_from("y", &y).unwrap());
+                let gradient = device.buffer::<f32>("gradient", 3 * pixels).unwrap();
+                let sums = device.buffer::<f32>("sums", 4).unwrap();
+                let mut rec = Recorder::new(device, "loss");
+                pass.record(&mut rec, &bands.get(0), &x, &y, &gradient, covered, weights, (&sums, 1));
+                rec.run().unwrap();
+                (gradient.read().unwrap(), sums.read().unwrap())
+            };
+            let [shader, native] = devices().map(|device| run(&device));
+            // E[x²]−E[x]² cancels about three digits.
+            assert_close("gradient", &shader.0, &native.0, 1e-3);
+            assert_close("sums", &shader.1, &native.1, 1e-5);
+        }
+    }
+}
+
+/// A training step's rasterisation with upstream noise: planes, and gradients of all parameters.
+fn rasterised(device: &Device, degree: u32, features: usize, size: [u32; 2]) -> Vec<(String, Vec<f32>)> {
+    let (splats, camera) = seeded::benchmark(900, size[0], size[1], degree, 5);
+    let codes = numbers(900 * features, 6);
+    let params = SplatBuffers::upload(device, &splats, &codes, features).unwrap();
+    let gradients = params.zeros_like(device).unwrap();
+    let mut raster = Rasterizer::new(device, 900, features, size[0], size[1]).unwrap();
+    let options = RasterOptions { sh_degree: degree, ..RasterOptions::default() };
+    raster.set_view(&View::new(&camera, 0.05)).unwrap();
+    raster.forward(&params, &options).unwrap();
+    let frame = raster.frame();
+    let pixels = frame.pixels() as usize;
+    frame.planes_grad.write(&numbers((5 + features) * pixels, 7)).unwrap();
+    let mut rec = Recorder::new(device, "backward");
+    raster.record_backward(&mut rec, &params, &options, &gradients);
+    rec.run().unwrap();
+    let frame = raster.frame();
+    let (by, by_features) = gradients.download().unwrap();
+    let mut out = vec![
+        ("planes".to_owned(), frame.planes.read().unwrap()),
+        ("transmittance".to_owned(), frame.transmittance.read().unwrap()),
+        ("camera".to_owned(), frame.camera_grad.read().unwrap()),
+        ("means".to_owned(), by.means.as_flattened().to_vec()),
+        ("log-scales".to_owned(), by.log_scales.as_flattened().to_vec()),
+        ("quaternions".to_owned(), by.quats.as_flattened().to_vec()),
+        ("opacities".to_owned(), by.opacity_logits),
+        ("SH".to_owned(), by.sh),
+        ("features".to_owned(), by_features),
+    ];
+    for (list, splats) in raster.tile_lists().unwrap().into_iter().enumerate() {
+        out.push((format!("list {list}"), splats.iter().map(|s| *s as f32).collect()));
+    }
+    out
+}
+
+#[test]
+fn rasterisation_matches_shaders() {
+    for (degree, features) in [(0, 0), (3, 3), (1, 8), (0, 16), (2, 37)] {
+        let [shader, native] = devices().map(|device| rasterised(&device, degree, features, [75, 53]));
+        for ((name, shader), (_, native)) in shader.iter().zip(&native) {
+            let exact = name.starts_with("list");
+            // Sums of noise over some hundred pixels, in another order.
+            assert_close(
+                &format!("{name}, degree {degree}, {features} features"),
+                shader,
+                native,
+                if exact { 0.0 } else { 3e-4 },
+            );
+        }
+    }
+}
