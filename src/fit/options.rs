@@ -137,7 +137,7 @@ impl RgbOptions {
     /// Options of the default preset. A thousand steps overfit a few photos: 0.9 dB more on them, 0.3
     /// less on views between them (docs/internals/experiments.md#how-long-to-train).
     fn short() -> Self {
-        RgbOptions { prune_every: 50, prune_from: 50, ..Self::scaled(150, 8.0) }
+        RgbOptions { prune_every: 50, prune_from: 50, ..Self::scaled(200, 5.0) }
     }
 
     /// Options of the draft preset, with fewer splats: on breakfast two fifths less time and 0.4 dB
@@ -169,7 +169,7 @@ impl RgbOptions {
                 means: Exponential { start: 1.6e-4 * speed, end: 1.6e-5 * speed, steps: iterations },
                 log_scales: 5e-3 * speed,
                 quats: 1e-3 * speed,
-                opacity: 0.025 * speed,
+                opacity: 0.02 * speed,
                 sh_dc: 2.5e-3 * speed,
                 sh_rest: 2.5e-3 / 20.0 * speed,
             },

@@ -10,6 +10,7 @@ mod project;
 mod project_backward;
 mod raster;
 mod scatter;
+mod small;
 mod sort;
 mod splat;
 mod ssim;
@@ -21,16 +22,22 @@ use crate::gpu::Native;
 /// All native passes.
 pub static ALL: &[Native] = &[
     Native { family: "adam", run: adam::run },
+    Native { family: "alpha_l1", run: small::alpha_l1 },
     Native { family: "bin_base", run: bin::base },
     Native { family: "bin_count", run: bin::count },
     Native { family: "bin_emit", run: bin::emit },
     Native { family: "bin_scan", run: bin::scan },
     Native { family: "bin_scatter", run: bin::scatter },
     Native { family: "bin_sum", run: bin::sum },
+    Native { family: "camera_sum", run: small::camera_sum },
+    Native { family: "clear_depth_gradient", run: small::clear_depth_gradient },
+    Native { family: "depth_l1", run: small::depth_l1 },
+    Native { family: "features_forward", run: small::features_forward },
     Native { family: "project", run: project::run },
     Native { family: "project_backward", run: project_backward::run },
     Native { family: "raster_backward", run: raster::backward },
     Native { family: "raster_forward", run: raster::forward },
+    Native { family: "ratio_penalty", run: small::ratio_penalty },
     Native { family: "scan_apply", run: sort::scan_apply },
     Native { family: "scan_lanes", run: sort::scan_lanes },
     Native { family: "scan_sums", run: sort::scan_sums },
@@ -40,6 +47,7 @@ pub static ALL: &[Native] = &[
     Native { family: "ssim_columns", run: ssim::columns },
     Native { family: "ssim_rows", run: ssim::rows },
     Native { family: "ssim_gradient", run: ssim::gradient },
+    Native { family: "sum", run: small::sum },
 ];
 
 /// Defines a function whose loops use vectors of eight numbers where the processor has them.

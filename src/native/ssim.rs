@@ -1,4 +1,5 @@
 //! `ssim_columns.comp`, `ssim_rows.comp` and `ssim_gradient.comp`.
+use super::small::sign;
 use super::vectorised;
 use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::ssim::{C1, C2, HALF, STRIP, WINDOW};
@@ -204,8 +205,7 @@ pub(super) fn gradient(call: &mut NativeCall) -> Result<(), String> {
                         u = share * (u - v) + v;
                     }
                     let difference = u - v;
-                    let sign = f32::from(u8::from(difference > 0.0)) - f32::from(u8::from(difference < 0.0));
-                    let mut slope = l1_weight * sign;
+                    let mut slope = l1_weight * sign(difference);
                     if with_ssim {
                         let [a, b, c] = [&blurred[0][k], &blurred[1][k], &blurred[2][k]];
                         slope -= dssim_weight * (a[x] + 2.0 * u * b[x] + v * c[x]);

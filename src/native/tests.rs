@@ -1,5 +1,7 @@
 //! Native passes against their shaders.
 use super::ALL;
+use crate::fit::scale::SceneScale;
+use crate::fit::{Preset, RgbOptions, fit_rgb};
 use crate::gpu::Recorder;
 use crate::gpu::{Device, Options, TestDevice};
 use crate::math::Random;
@@ -8,7 +10,7 @@ use crate::pass::bands::Bands;
 use crate::pass::ssim_l1::{SsimL1, SsimRowKernel};
 use crate::pass::view::View;
 use crate::pass::{RasterOptions, Rasterizer, SplatBuffers};
-use crate::scene::seeded;
+use crate::scene::{DepthMap, Image, RgbImage, Splats, seeded};
 
 /// The device without native passes, and with them.
 fn devices() -> [TestDevice; 2] {
@@ -144,5 +146,30 @@ fn rasterisation_matches_shaders() {
                 if exact { 0.0 } else { 3e-4 },
             );
         }
+    }
+}
+
+/// Splats after some steps with every loss.
+fn trained(device: &Device, degree: u32) -> Splats {
+    let (splats, camera) = seeded::small(300, 75, 53, degree, 8);
+    let depth = Image::filled(75, 53, 3.0);
+    let depths = [DepthMap { confidence: Image::filled(75, 53, 1.0), depth }];
+    let colour = |p: usize| [0, 1, 2].map(|c| ((p * (c + 2)) % 17) as f32 / 16.0);
+    let images = [RgbImage { width: 75, height: 53, data: (0..75 * 53).map(colour).collect() }];
+    let cameras = [camera];
+    let options =
+        RgbOptions { iterations: 4, bounded: false, virtual_views: 0, ..RgbOptions::preset(Preset::Draft) };
+    let scale = SceneScale::measure(&cameras, &splats.means);
+    let (depths, silent) = (Some(&depths[..]), &crate::progress::Silent);
+    fit_rgb(device, &images, &cameras, splats, scale, depths, &options, silent).unwrap().splats
+}
+
+#[test]
+fn training_steps_match_shaders() {
+    for degree in [0, 2] {
+        let [shader, native] = devices().map(|device| trained(&device, degree));
+        assert_close("means", shader.means.as_flattened(), native.means.as_flattened(), 1e-3);
+        assert_close("scales", shader.log_scales.as_flattened(), native.log_scales.as_flattened(), 1e-2);
+        assert_close("SH", &shader.sh, &native.sh, 1e-2);
     }
 }

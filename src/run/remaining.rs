@@ -10,7 +10,7 @@ const TYPICAL_PIXELS: f64 = 640.0 * 480.0;
 /// Number of these photos.
 const TYPICAL_PHOTOS: f64 = 4.0;
 /// Training steps that the typical seconds are of.
-const TYPICAL_STEPS: f64 = 150.0;
+const TYPICAL_STEPS: f64 = 200.0;
 /// Typical seconds that the pace of the machine is at first assumed for. They keep the noise of the
 /// first short stages out of the estimate.
 const PRIOR: f64 = 5.0;
@@ -58,7 +58,7 @@ fn parts(work: &Work) -> Vec<Part> {
         ("dense stereo", 26.0, 0.3, pixels),
         ("surfaces", 3.0, 1.1, pixels),
         ("initial splats", 1.5, 0.4, pixels),
-        ("splats", 75.0, 0.3, steps),
+        ("splats", 60.0, 0.3, steps),
         // Half of the time on photos of shiny things; matt ones skip it.
         ("view dependence", 6.0, 0.2, pixels * view_dependence),
         ("language", 2.0, 0.4, pixels),
