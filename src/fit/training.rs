@@ -270,7 +270,9 @@ mod tests {
 
     fn colour_options() -> RgbOptions {
         let rate = Exponential { start: 1e-3, end: 1e-4, steps: 2 * COUNTED };
-        RgbOptions { poses: Some(PoseOptions { start: 0, rate }), ..RgbOptions::preset(Preset::Draft) }
+        // Slow enough that no tile list grows while steps are counted.
+        let rates = RgbOptions::preset(Preset::Paper).rates;
+        RgbOptions { poses: Some(PoseOptions { start: 0, rate }), rates, ..RgbOptions::preset(Preset::Draft) }
     }
 
     fn colour(device: &Device) -> Outcome {

@@ -214,7 +214,7 @@ mod tests {
     use super::*;
 
     fn work() -> Work {
-        Work { on_cpu: true, photos: 4, pixels: 4 * 640 * 480, steps: 120, language: true, built_in: true }
+        Work { on_cpu: true, photos: 4, pixels: 4 * 640 * 480, steps: 200, language: true, built_in: true }
     }
 
     fn course(work: &Work) -> Course {
