@@ -79,7 +79,7 @@ void main() {
     while (j < last) {
         load_batch(j, last, lane);
         uint batch = min(uint(SUBGROUP_SIZE), last - j);
-        // As in raster_backward.glsl: each half of the subgroup keeps its half sum of splat i.
+        // Each half of the subgroup keeps its half sum of splat i, see raster_backward.glsl.
         float low[SLOTS], high[SLOTS];
         [[unroll]] for (int s = 0; s < SLOTS; s++) low[s] = high[s] = 0.0;
         for (uint i = 0; i < batch; i++) {

@@ -134,8 +134,8 @@ impl RgbOptions {
         options
     }
 
-    /// Options of the default preset. A thousand steps overfit a few photos: 0.9 dB more on them, 0.3
-    /// less on views between them (docs/internals/experiments.md#how-long-to-train).
+    /// Options of the default preset. A thousand steps overfit a few photos: 0.9 dB more on them,
+    /// 0.3 less on views between them (docs/internals/experiments.md#how-long-to-train).
     fn short() -> Self {
         RgbOptions { prune_every: 50, prune_from: 50, ..Self::scaled(200, 5.0) }
     }
@@ -152,8 +152,8 @@ impl RgbOptions {
         let paper = Self::paper();
         RgbOptions {
             iterations,
-            // Stereo points are dense, on surfaces and of the right colour, so splats start as nearly
-            // opaque discs: from spheres of an opacity of 0.1, the first hundred steps would only
+            // Stereo points are dense, on surfaces and of the right colour, so splats start as
+            // nearly opaque discs: from spheres of an opacity of 0.1, the first hundred steps would only
             // flatten them and raise it.
             init: InitOptions {
                 max_points: 200_000,

@@ -164,33 +164,23 @@ fn reaches(powers: &Row) -> bool {
     powers.iter().fold(f32::MIN, |m, p| if *p > m { *p } else { m }) >= POWER_LEAST
 }
 
-vectorised! {
-/// Blends splats, nearest first, into a row of pixels; `t` is negative where a pixel has stopped.
-fn blend_row4(splats: &[Splat<4>], x: f32, y: f32, t: &mut Row, sums: &mut [Row; 4]) {
-    blend_row(splats, x, y, t, sums);
+/// Defines [`blend_row`] for a number of channels.
+macro_rules! blend_of {
+    ($name:ident, $channels:literal) => {
+        vectorised! {
+        fn $name(splats: &[Splat<$channels>], x: f32, y: f32, t: &mut Row, sums: &mut [Row; $channels]) {
+            blend_row(splats, x, y, t, sums);
+        }
+        }
+    };
 }
-}
-vectorised! {
-fn blend_row7(splats: &[Splat<7>], x: f32, y: f32, t: &mut Row, sums: &mut [Row; 7]) {
-    blend_row(splats, x, y, t, sums);
-}
-}
-vectorised! {
-fn blend_row12(splats: &[Splat<12>], x: f32, y: f32, t: &mut Row, sums: &mut [Row; 12]) {
-    blend_row(splats, x, y, t, sums);
-}
-}
-vectorised! {
-fn blend_row16(splats: &[Splat<16>], x: f32, y: f32, t: &mut Row, sums: &mut [Row; 16]) {
-    blend_row(splats, x, y, t, sums);
-}
-}
-vectorised! {
-fn blend_row20(splats: &[Splat<20>], x: f32, y: f32, t: &mut Row, sums: &mut [Row; 20]) {
-    blend_row(splats, x, y, t, sums);
-}
-}
+blend_of!(blend_row4, 4);
+blend_of!(blend_row7, 7);
+blend_of!(blend_row12, 12);
+blend_of!(blend_row16, 16);
+blend_of!(blend_row20, 20);
 
+/// Blends splats, nearest first, into a row of pixels; `t` is negative where a pixel has stopped.
 #[inline(always)]
 fn blend_row<const C: usize>(splats: &[Splat<C>], x: f32, y: f32, t: &mut Row, sums: &mut [Row; C]) {
     let (mut own_t, mut own) = (*t, *sums);
@@ -354,6 +344,7 @@ fn gradients_of<const C: usize>(
     (moments, channels.map(|lanes| lanes.iter().sum()))
 }
 
+/// Defines [`gradients_of`] for a number of channels.
 macro_rules! backward_of {
     ($name:ident, $channels:literal) => {
         vectorised! {

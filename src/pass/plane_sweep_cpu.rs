@@ -64,7 +64,7 @@ struct Window {
 pub struct Inputs<'a> {
     /// Luma of all views, one after the other.
     luma: &'a [f32],
-    /// The same for the sources, with the neighbours of each pixel.
+    /// Luma of the sources, with the neighbours of each pixel.
     quads: &'a [Quad],
     /// Source views of all references.
     sources: &'a [SourceView],

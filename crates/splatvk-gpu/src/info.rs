@@ -35,8 +35,8 @@ pub struct Options {
     /// Keeps compiled pipelines, and the kernel variants that are disabled on a device, from one
     /// process to the next. Not used on a host's device.
     pub cache: Option<Arc<dyn Cache>>,
-    /// Native code in place of shaders, where the device is the processor and buffers are mapped. Not
-    /// used on a host's device.
+    /// Native code in place of shaders, where the device is the processor and buffers are mapped.
+    /// Not used on a host's device.
     pub natives: &'static [Native],
     /// Names of kernel variants not to be used. The crate itself knows [`NATIVE_FLOAT_ATOMICS`];
     /// the others are the program's, which finds them in [`DeviceInfo::disabled`].

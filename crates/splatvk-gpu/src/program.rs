@@ -127,8 +127,8 @@ impl Program {
         Ok(())
     }
 
-    /// Divides the commands by where they run: whether in native code, and which. Fills and copies run
-    /// where the command before them does, since a change of place is a submission more.
+    /// Divides the commands by where they run: whether in native code, and which. Fills and copies
+    /// run where the command before them does, since a change of place is a submission more.
     fn places(&self) -> Vec<(bool, Range<usize>)> {
         let natives = self.device.0.natives;
         let is_native = |command: &Command| match &command.op {

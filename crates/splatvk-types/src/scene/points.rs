@@ -14,8 +14,8 @@ pub struct PointCloud {
     pub view: Vec<u8>,
     /// [N] footprint of one pixel at the point's depth, `z / f`, world units.
     pub radius: Vec<f32>,
-    /// [N, 3] unit normal of the surface, world axes, of either sign; zero where it is not known, and
-    /// empty where none is.
+    /// [N, 3] unit normal of the surface, world axes, of either sign; zero where it is not known,
+    /// and empty where none is.
     #[serde(default)]
     pub normals: Vec<[f32; 3]>,
 }
