@@ -5,11 +5,15 @@ use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::cutoffs::LOG2_ALPHA_MIN;
 use crate::gpu::shaders::shared::layout::{PROJECTED_FLOATS, TILE};
 use crate::gpu::shaders::shared::tiles::{MARGIN, ROW_SLACK};
+use fearless_simd::{Level, Simd, dispatch, f32x8, i32x8, prelude::*};
 use rayon::prelude::*;
 use std::ops::RangeInclusive;
 
 const FLOATS: usize = PROJECTED_FLOATS as usize;
 const EDGE: f32 = TILE as f32;
+/// Rows of tiles whose intervals are computed at once.
+const LANES: usize = 8;
+const STEPS: [f32; LANES] = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0];
 
 /// Rows of tiles that are binned, and the number of columns.
 #[derive(Clone, Copy)]
@@ -32,49 +36,127 @@ struct Ellipse {
 }
 
 impl Ellipse {
-    fn of(p: &[f32; FLOATS], grid: Grid) -> Ellipse {
-        let [u, v, a, b, c, log2_opacity, det, ..] = *p;
-        let inv_a = 1.0 / a;
-        let k = (log2_opacity - LOG2_ALPHA_MIN as f32 + MARGIN as f32).max(0.0) * a;
+    /// Ellipses of eight splats.
+    #[inline(always)]
+    fn of<S: Simd>(simd: S, splats: [&[f32; FLOATS]; LANES], grid: Grid) -> [Ellipse; LANES] {
+        let number = |value: f32| f32x8::simd_from(simd, value);
+        let field = |k: usize| f32x8::simd_from(simd, std::array::from_fn(|lane| splats[lane][k]));
+        let root = |square: f32x8<S>| square.max_precise(0.0).sqrt();
+        let [u, v, a, b] = [field(0), field(1), field(2), field(3)];
+        let [c, log2_opacity, det] = [field(4), field(5), field(6)];
+        let inv_a = number(1.0) / a;
+        let k = (log2_opacity - LOG2_ALPHA_MIN as f32 + MARGIN as f32).max_precise(0.0) * a;
         let kc = k * inv_a * c;
-        let (half_height, half_width) = ((-k / det).max(0.0).sqrt(), (-kc / det).max(0.0).sqrt());
-        let (slope, slope_y) = (-0.5 * b * inv_a, -0.5 * b / c);
+        let (half_height, half_width) = (root(-k / det), root(-kc / det));
+        let (slope, slope_y) = (b * -0.5 * inv_a, b * -0.5 / c);
         let low = -u;
         let high = low + (grid.columns as f32 * EDGE - 1.0);
         let lowest = slope * half_height;
-        let (bottom, top) = (clamped(lowest, low, high), clamped(-lowest, low, high));
-        let chord = |at: f32| (-kc - det * at * at).max(0.0).sqrt() / c;
-        let down = if bottom == lowest { half_height } else { slope_y * bottom - chord(bottom) };
-        let up = if top == -lowest { -half_height } else { slope_y * top + chord(top) };
+        let within = |at: f32x8<S>| at.max_precise(low).min_precise(high);
+        let (bottom, top) = (within(lowest), within(-lowest));
+        let chord = |at: f32x8<S>| root(-kc - det * at * at) / c;
+        let down = bottom.simd_eq(lowest).select(half_height, slope_y * bottom - chord(bottom));
+        let up = top.simd_eq(-lowest).select(-half_height, slope_y * top + chord(top));
         let (begin, end) = (grid.first_row as f32, grid.end_row as f32);
         let slack = ROW_SLACK as f32;
-        let first = clamped(((v + up - slack - (EDGE - 1.0)) / EDGE).ceil(), begin, end) as i32;
-        let last = clamped(((v + down + slack) / EDGE).floor(), begin - 1.0, end - 1.0) as i32;
-        let last = if log2_opacity < LOG2_ALPHA_MIN as f32 { first - 1 } else { last };
-        Ellipse { u, v, inv_a, det, k, slope, right_dy: slope_y * half_width, rows: first..=last }
+        let first = (v + up - slack - (EDGE - 1.0)) * (1.0 / EDGE);
+        let last = (v + down + slack) * (1.0 / EDGE);
+        let first = first.ceil().max_precise(begin).min_precise(end);
+        let last = last.floor().max_precise(begin - 1.0).min_precise(end - 1.0);
+        let last = log2_opacity.simd_lt(LOG2_ALPHA_MIN as f32).select(first - 1.0, last);
+        let right_dy = slope_y * half_width;
+        std::array::from_fn(|lane| Ellipse {
+            u: u[lane],
+            v: v[lane],
+            inv_a: inv_a[lane],
+            det: det[lane],
+            k: k[lane],
+            slope: slope[lane],
+            right_dy: right_dy[lane],
+            rows: first[lane] as i32..=last[lane] as i32,
+        })
     }
 
-    /// Tiles of a row.
-    fn tiles(&self, row: i32, columns: u32) -> RangeInclusive<i32> {
-        let low = row as f32 * EDGE - self.v;
+    /// First and last tile of eight rows, beginning at `row`.
+    #[inline(always)]
+    fn tiles<S: Simd>(&self, simd: S, row: i32, columns: u32) -> [[i32; LANES]; 2] {
+        let number = |value: f32| f32x8::simd_from(simd, value);
+        let low = f32x8::simd_from(simd, STEPS) * EDGE + row as f32 * EDGE - self.v;
         let high = low + (EDGE - 1.0);
-        let (right, left) = (clamped(self.right_dy, low, high), clamped(-self.right_dy, low, high));
-        let chord = |at: f32| (-self.k - self.det * at * at).max(0.0).sqrt();
-        let x1 = self.u + self.slope * right - self.inv_a * chord(right);
-        let x0 = self.u + self.slope * left + self.inv_a * chord(left);
+        let within = |value: f32| number(value).max_precise(low).min_precise(high);
+        let chord = |at: f32x8<S>| (-(at * self.det * at) - self.k).max_precise(0.0).sqrt();
+        let (right, left) = (within(self.right_dy), within(-self.right_dy));
+        let x1 = right * self.slope + self.u - chord(right) * self.inv_a;
+        let x0 = left * self.slope + self.u + chord(left) * self.inv_a;
         let last = columns as f32 - 1.0;
-        let from = clamped(((x0 - (EDGE - 1.0)) / EDGE).ceil(), 0.0, last + 1.0) as i32;
-        from..=clamped((x1 / EDGE).floor(), -1.0, last) as i32
+        let from = ((x0 - (EDGE - 1.0)) * (1.0 / EDGE)).ceil().max_precise(0.0).min_precise(last + 1.0);
+        let to = (x1 * (1.0 / EDGE)).floor().max_precise(-1.0).min_precise(last);
+        [from, to].map(|ends| ends.to_int::<i32x8<S>>().to_array())
+    }
+
+    /// Calls `f` with each row of tiles and its first and last tile.
+    #[inline(always)]
+    fn each_row<S: Simd>(&self, simd: S, columns: u32, mut f: impl FnMut(i32, i32, i32)) {
+        let (mut row, end) = (*self.rows.start(), *self.rows.end());
+        while row <= end {
+            let [from, to] = self.tiles(simd, row, columns);
+            for lane in 0..LANES.min((end - row + 1) as usize) {
+                f(row + lane as i32, from[lane], to[lane]);
+            }
+            row += LANES as i32;
+        }
     }
 }
 
-/// GLSL's `clamp`, which gives a number also for a NaN.
-fn clamped(value: f32, low: f32, high: f32) -> f32 {
-    value.max(low).min(high)
+/// Calls `f` with the place of each splat of `pairs`, each of its rows of tiles, and the first and
+/// last tile there.
+#[inline(always)]
+fn each_row<S: Simd>(
+    simd: S,
+    pairs: &[[u32; 2]],
+    projected: &[[f32; FLOATS]],
+    grid: Grid,
+    mut f: impl FnMut(usize, i32, i32, i32),
+) {
+    for (group, pairs) in pairs.chunks(LANES).enumerate() {
+        let splats = std::array::from_fn(|lane| &projected[pairs[lane.min(pairs.len() - 1)][1] as usize]);
+        for (lane, ellipse) in Ellipse::of(simd, splats, grid)[..pairs.len()].iter().enumerate() {
+            ellipse.each_row(simd, grid.columns, |row, from, to| f(group * LANES + lane, row, from, to));
+        }
+    }
 }
 
-fn width(tiles: &RangeInclusive<i32>) -> u32 {
-    (tiles.end() - tiles.start() + 1).max(0) as u32
+/// Writes the entries of splats, and counts those of each tile.
+#[inline(always)]
+fn emit_all<S: Simd>(
+    simd: S,
+    pairs: &[[u32; 2]],
+    projected: &[[f32; FLOATS]],
+    grid: Grid,
+    out: &mut [[u32; 2]],
+    counts: &mut [u32],
+) {
+    let mut out = out.iter_mut();
+    each_row(simd, pairs, projected, grid, |k, row, from, to| {
+        let first = (row as u32 - grid.first_row) * grid.columns;
+        for (x, entry) in (from..=to).zip(&mut out) {
+            let tile = first + x as u32;
+            *entry = [tile, pairs[k][1]];
+            counts[tile as usize] += 1;
+        }
+    });
+}
+
+#[inline(always)]
+fn count_all<S: Simd>(
+    simd: S,
+    pairs: &[[u32; 2]],
+    projected: &[[f32; FLOATS]],
+    grid: Grid,
+    counts: &mut [u32],
+) {
+    counts.fill(0);
+    each_row(simd, pairs, projected, grid, |k, _, from, to| counts[k] += (to - from + 1).max(0) as u32);
 }
 
 pub(super) fn count(call: &mut NativeCall) -> Result<(), String> {
@@ -82,10 +164,10 @@ pub(super) fn count(call: &mut NativeCall) -> Result<(), String> {
     let grid = Grid { columns, first_row, end_row };
     let [projected, pairs, counts] = call.memory([0, 1, 2])?;
     let (projected, pairs): (&[[f32; FLOATS]], &[[u32; 2]]) = (projected.of(), pairs.of());
-    let counts = counts.of::<u32>()[..count as usize].par_iter_mut().with_min_len(1024).enumerate();
-    counts.for_each(|(rank, count)| {
-        let ellipse = Ellipse::of(&projected[pairs[rank][1] as usize], grid);
-        *count = ellipse.rows.clone().map(|row| width(&ellipse.tiles(row, columns))).sum();
+    let counts = counts.of::<u32>()[..count as usize].par_chunks_mut(1024);
+    let level = Level::new();
+    counts.zip(pairs.par_chunks(1024)).for_each(|(counts, pairs)| {
+        dispatch!(level, simd => count_all(simd, &pairs[..counts.len()], projected, grid, counts));
     });
     Ok(())
 }
@@ -118,6 +200,7 @@ pub(super) fn emit(call: &mut NativeCall) -> Result<(), String> {
     if !fits {
         return Ok(());
     }
+    let level = Level::new();
     let tiles = (columns * (end_row - first_row)) as usize;
     let mut parts = Vec::with_capacity(lanes);
     let mut rest = &mut entries.of::<[u32; 2]>()[..total as usize];
@@ -131,19 +214,7 @@ pub(super) fn emit(call: &mut NativeCall) -> Result<(), String> {
         .into_par_iter()
         .map(|(ranks, out)| {
             let mut counts = vec![0; tiles];
-            let mut out = out.iter_mut();
-            for pair in &pairs[ranks] {
-                let ellipse = Ellipse::of(&projected[pair[1] as usize], grid);
-                for row in ellipse.rows.clone() {
-                    for x in ellipse.tiles(row, columns) {
-                        let tile = (row as u32 - first_row) * columns + x as u32;
-                        if let Some(entry) = out.next() {
-                            *entry = [tile, pair[1]];
-                            counts[tile as usize] += 1;
-                        }
-                    }
-                }
-            }
+            dispatch!(level, simd => emit_all(simd, &pairs[ranks], projected, grid, out, &mut counts));
             counts
         })
         .collect();

@@ -6,6 +6,9 @@
 //! shader.
 mod adam;
 mod bin;
+mod blend;
+mod decode;
+mod label_weights;
 mod project;
 mod project_backward;
 mod raster;
@@ -16,6 +19,7 @@ mod splat;
 mod ssim;
 #[cfg(test)]
 mod tests;
+mod tile;
 
 use crate::gpu::Native;
 
@@ -31,8 +35,10 @@ pub static ALL: &[Native] = &[
     Native { family: "bin_sum", run: bin::sum },
     Native { family: "camera_sum", run: small::camera_sum },
     Native { family: "clear_depth_gradient", run: small::clear_depth_gradient },
+    Native { family: "decode", run: decode::run },
     Native { family: "depth_l1", run: small::depth_l1 },
     Native { family: "features_forward", run: small::features_forward },
+    Native { family: "label_weights", run: label_weights::run },
     Native { family: "project", run: project::run },
     Native { family: "project_backward", run: project_backward::run },
     Native { family: "raster_backward", run: raster::backward },
@@ -49,27 +55,3 @@ pub static ALL: &[Native] = &[
     Native { family: "ssim_gradient", run: ssim::gradient },
     Native { family: "sum", run: small::sum },
 ];
-
-/// Defines a function whose loops use vectors of eight numbers where the processor has them.
-macro_rules! vectorised {
-    ($(#[$doc:meta])* fn $name:ident($($arg:ident: $type:ty),* $(,)?) $(-> $out:ty)? $body:block) => {
-        $(#[$doc])*
-        fn $name($($arg: $type),*) $(-> $out)? {
-            #[inline(always)]
-            fn plain($($arg: $type),*) $(-> $out)? $body
-            #[cfg(target_arch = "x86_64")]
-            {
-                #[target_feature(enable = "avx2")]
-                fn avx2($($arg: $type),*) $(-> $out)? {
-                    plain($($arg),*)
-                }
-                if std::arch::is_x86_feature_detected!("avx2") {
-                    // SAFETY: the processor has AVX2.
-                    return unsafe { avx2($($arg),*) };
-                }
-            }
-            plain($($arg),*)
-        }
-    };
-}
-pub(crate) use vectorised;

@@ -1,39 +1,56 @@
 //! `ssim_columns.comp`, `ssim_rows.comp` and `ssim_gradient.comp`.
 use super::small::sign;
-use super::vectorised;
 use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::ssim::{C1, C2, HALF, STRIP, WINDOW};
+use fearless_simd::{Level, Simd, dispatch, f32x8, prelude::*};
 use rayon::prelude::*;
 
 const REACH: usize = HALF as usize;
 const ROWS: usize = STRIP as usize;
 const TAPS: usize = WINDOW.len();
+const LANES: usize = 8;
 /// Rows that the outputs of a strip read.
 const READ: usize = ROWS + 2 * REACH;
 
-vectorised! {
-/// `out[x] += w · row[x]`.
-fn add_scaled(out: &mut [f32], row: &[f32], w: f32) {
-    for (o, v) in out.iter_mut().zip(row) {
-        *o += w * v;
+/// The weighted sum of eleven vectors.
+#[inline(always)]
+fn blur<S: Simd>(simd: S, mut tap: impl FnMut(usize) -> f32x8<S>) -> f32x8<S> {
+    let mut sum = f32x8::simd_from(simd, 0.0);
+    for (k, w) in WINDOW.iter().enumerate() {
+        sum = tap(k).mul_add(f32x8::simd_from(simd, *w as f32), sum);
     }
-}
+    sum
 }
 
-/// Rows that a strip reads, beginning at `first`; `None` outside the image.
-fn rows_read(first: usize, height: usize) -> impl Iterator<Item = Option<usize>> {
-    (0..READ).map(move |i| (first + i).checked_sub(REACH).filter(|y| *y < height))
+/// Row `k` of a vertical blur of rows of `out.len()` numbers, a multiple of eight.
+#[inline(always)]
+fn blur_columns<S: Simd>(simd: S, rows: &[f32], k: usize, out: &mut [f32]) {
+    let stride = out.len();
+    for (block, out) in out.chunks_exact_mut(LANES).enumerate() {
+        let at = k * stride + block * LANES;
+        blur(simd, |tap| f32x8::from_slice(simd, &rows[at + tap * stride..][..LANES])).store_slice(out);
+    }
 }
 
-/// Blurred columns of a strip from the rows that it reads, each [width]; rows outside are `None`.
-fn blur_columns(rows: &[Option<Vec<f32>>], out: &mut [Vec<f32>]) {
-    for (k, out) in out.iter_mut().enumerate() {
-        for (tap, w) in WINDOW.iter().enumerate() {
-            if let Some(row) = &rows[k + tap] {
-                add_scaled(out, row, *w as f32);
-            }
-        }
+/// Horizontal blur of a row that begins [`REACH`] before the first output.
+#[inline(always)]
+fn blur_row<S: Simd>(simd: S, row: &[f32], out: &mut [f32]) {
+    for (block, out) in out.chunks_exact_mut(LANES).enumerate() {
+        let at = block * LANES;
+        blur(simd, |tap| f32x8::from_slice(simd, &row[at + tap..][..LANES])).store_slice(out);
     }
+}
+
+/// Numbers of a row in whole vectors.
+fn padded(width: usize) -> usize {
+    width.next_multiple_of(LANES)
+}
+
+/// The rows that a strip reads, and the row of its scratch memory that each goes to; rows outside
+/// of the image are not among them.
+fn rows_read(strip: usize, height: usize) -> impl Iterator<Item = (usize, usize)> {
+    let row = move |i: usize| Some((i, (strip * ROWS + i).checked_sub(REACH).filter(|y| *y < height)?));
+    (0..READ).filter_map(row)
 }
 
 /// Vertical blurs of (x, y) and (x² + y², xy).
@@ -45,36 +62,37 @@ pub(super) fn columns(call: &mut NativeCall) -> Result<(), String> {
     let weights = (weighted != 0).then(|| &target[3 * plane..4 * plane]);
     let means = means.of::<[f32; 2]>()[..3 * plane].par_chunks_mut(plane);
     let moments = moments.of::<[f32; 2]>()[..3 * plane].par_chunks_mut(plane);
+    let (stride, level) = (padded(width), Level::new());
     means.zip(moments).enumerate().for_each(|(channel, (means, moments))| {
         let (x, y) = (&rendered[channel * plane..], &target[channel * plane..]);
         let strips = means.par_chunks_mut(ROWS * width).zip(moments.par_chunks_mut(ROWS * width));
         strips.enumerate().for_each(|(strip, (means, moments))| {
-            let mut rows: [Vec<Option<Vec<f32>>>; 4] = Default::default();
-            for row in rows_read(strip * ROWS, height) {
-                let Some(row) = row else {
-                    rows.iter_mut().for_each(|r| r.push(None));
-                    continue;
-                };
-                let at = row * width..(row + 1) * width;
-                let (mut u, v) = (x[at.clone()].to_vec(), y[at.clone()].to_vec());
+            let mut rows: [Vec<f32>; 4] = std::array::from_fn(|_| vec![0.0; READ * stride]);
+            let mut out: [Vec<f32>; 4] = std::array::from_fn(|_| vec![0.0; stride]);
+            for (i, row) in rows_read(strip, height) {
+                let (own, at) = (i * stride..i * stride + width, row * width..(row + 1) * width);
+                let [u, v, squares, products] = rows.each_mut().map(|row| &mut row[own.clone()]);
+                u.copy_from_slice(&x[at.clone()]);
+                v.copy_from_slice(&y[at.clone()]);
                 if let Some(weights) = weights {
-                    u.iter_mut().zip(&v).zip(&weights[at]).for_each(|((u, v), w)| *u = w * (*u - v) + v);
+                    u.iter_mut().zip(&*v).zip(&weights[at]).for_each(|((u, v), w)| *u = w * (*u - v) + v);
                 }
-                let squares = u.iter().zip(&v).map(|(u, v)| u * u + v * v).collect();
-                let products = u.iter().zip(&v).map(|(u, v)| u * v).collect();
-                rows.iter_mut().zip([u, v, squares, products]).for_each(|(r, own)| r.push(Some(own)));
+                for k in 0..width {
+                    squares[k] = u[k] * u[k] + v[k] * v[k];
+                    products[k] = u[k] * v[k];
+                }
             }
-            let count = means.len() / width;
-            let blurred = rows.map(|rows| {
-                let mut out = vec![vec![0.0; width]; count];
-                blur_columns(&rows, &mut out);
-                out
-            });
-            let [u, v, squares, products] = &blurred;
-            for k in 0..count {
+            let strip = means.chunks_exact_mut(width).zip(moments.chunks_exact_mut(width));
+            for (k, (means, moments)) in strip.enumerate() {
+                dispatch!(level, simd => {
+                    for (rows, out) in rows.iter().zip(&mut out) {
+                        blur_columns(simd, rows, k, out);
+                    }
+                });
+                let [u, v, squares, products] = &out;
                 for x in 0..width {
-                    means[k * width + x] = [u[k][x], v[k][x]];
-                    moments[k * width + x] = [squares[k][x], products[k][x]];
+                    means[x] = [u[x], v[x]];
+                    moments[x] = [squares[x], products[x]];
                 }
             }
         });
@@ -82,17 +100,9 @@ pub(super) fn columns(call: &mut NativeCall) -> Result<(), String> {
     Ok(())
 }
 
-/// Four padded rows, blurred horizontally.
-fn blur_row(padded: &[f32], out: &mut [f32]) {
-    out.fill(0.0);
-    for (tap, w) in WINDOW.iter().enumerate() {
-        add_scaled(out, &padded[tap..], *w as f32);
-    }
-}
-
-vectorised! {
 /// SSIM and its derivatives by (E[x], E[x²], E[xy]) from blurred (x, y) and (x² + y², xy): planes
 /// of `blurred` to those of `out`.
+#[inline(always)]
 fn ssim_of(blurred: &[Vec<f32>; 4], out: &mut [Vec<f32>; 4]) {
     let [x, y, squares, products] = blurred;
     let [by_mean, by_square, by_product, ssim] = out;
@@ -104,13 +114,39 @@ fn ssim_of(blurred: &[Vec<f32>; 4], out: &mut [Vec<f32>; 4]) {
         let (b1, b2) = (sum + c1, (squares[k] - sum) + c2);
         let inverse = 1.0 / (b1 * b2);
         let s = a1 * a2 * inverse;
-        by_mean[k] =
-            2.0 * y[k] * (a2 - a1) * inverse - 2.0 * x[k] * s / b1 + 2.0 * x[k] * s / b2;
+        by_mean[k] = 2.0 * y[k] * (a2 - a1) * inverse - 2.0 * x[k] * s / b1 + 2.0 * x[k] * s / b2;
         by_square[k] = -s / b2;
         by_product[k] = 2.0 * a1 * inverse;
         ssim[k] = s;
     }
 }
+
+/// Memory of one row of [`rows`].
+struct RowScratch {
+    /// The four inputs, then the three derivatives, with a margin of zeros.
+    wide: [Vec<f32>; 4],
+    blurred: [Vec<f32>; 4],
+    derivatives: [Vec<f32>; 4],
+}
+
+impl RowScratch {
+    fn new(width: usize) -> RowScratch {
+        let stride = padded(width);
+        let planes = |length: usize| std::array::from_fn(|_| vec![0.0; length]);
+        RowScratch { wide: planes(stride + TAPS - 1), blurred: planes(stride), derivatives: planes(stride) }
+    }
+
+    #[inline(always)]
+    fn compute<S: Simd>(&mut self, simd: S, width: usize) {
+        for (wide, blurred) in self.wide.iter().zip(&mut self.blurred) {
+            blur_row(simd, wide, blurred);
+        }
+        ssim_of(&self.blurred, &mut self.derivatives);
+        for k in 0..3 {
+            self.wide[k][REACH..REACH + width].copy_from_slice(&self.derivatives[k][..width]);
+            blur_row(simd, &self.wide[k], &mut self.blurred[k]);
+        }
+    }
 }
 
 /// Horizontal blurs, SSIM, and the horizontal blurs of its derivatives.
@@ -122,38 +158,60 @@ pub(super) fn rows(call: &mut NativeCall) -> Result<(), String> {
     let slopes = slopes.of::<[f32; 2]>()[..rows * width].par_chunks_mut(width);
     let cross = cross.of::<f32>()[..rows * width].par_chunks_mut(width);
     let sums = sums.of::<f32>()[..rows * strips].par_chunks_mut(strips);
-    let padded = || vec![0.0f32; width + 2 * REACH];
-    let scratch = || (std::array::from_fn(|_| padded()), Default::default(), Default::default());
+    let level = Level::new();
     slopes.zip(cross).zip(sums).enumerate().for_each_init(
-        scratch,
-        |(wide, blurred, derivatives): &mut ([Vec<f32>; 4], [Vec<f32>; 4], [Vec<f32>; 4]), (row, out)| {
-            let ((slopes, cross), sums) = out;
+        || RowScratch::new(width),
+        |scratch, (row, ((slopes, cross), sums))| {
             let at = row * width..(row + 1) * width;
             for (k, (mean, moment)) in means[at.clone()].iter().zip(&moments[at]).enumerate() {
-                [wide[0][k + REACH], wide[1][k + REACH]] = *mean;
-                [wide[2][k + REACH], wide[3][k + REACH]] = *moment;
+                [scratch.wide[0][k + REACH], scratch.wide[1][k + REACH]] = *mean;
+                [scratch.wide[2][k + REACH], scratch.wide[3][k + REACH]] = *moment;
             }
-            for (wide, blurred) in wide.iter().zip(blurred.iter_mut()) {
-                blurred.resize(width, 0.0);
-                blur_row(wide, blurred);
-            }
-            derivatives.iter_mut().for_each(|d| d.resize(width, 0.0));
-            ssim_of(blurred, derivatives);
+            dispatch!(level, simd => scratch.compute(simd, width));
             let is_counted = (first..end).contains(&(row % height));
-            for (sum, own) in sums.iter_mut().zip(derivatives[3].chunks(ROWS)) {
+            for (sum, own) in sums.iter_mut().zip(scratch.derivatives[3][..width].chunks(ROWS)) {
                 *sum = if is_counted { own.iter().sum() } else { 0.0 };
             }
-            for k in 0..3 {
-                wide[k][REACH..REACH + width].copy_from_slice(&derivatives[k]);
-                blur_row(&wide[k], &mut blurred[k]);
-            }
             for x in 0..width {
-                slopes[x] = [blurred[0][x], blurred[1][x]];
-                cross[x] = blurred[2][x];
+                slopes[x] = [scratch.blurred[0][x], scratch.blurred[1][x]];
+                cross[x] = scratch.blurred[2][x];
             }
         },
     );
     Ok(())
+}
+
+/// The loss of [`gradient`], and the images of one channel.
+struct Loss<'a> {
+    x: &'a [f32],
+    y: &'a [f32],
+    weights: Option<&'a [f32]>,
+    l1_weight: f32,
+    dssim_weight: f32,
+}
+
+impl Loss<'_> {
+    /// The gradient of pixels `at`, from the blurred derivatives; adds the absolute differences.
+    #[inline(always)]
+    fn differentiate(
+        &self,
+        at: std::ops::Range<usize>,
+        blurred: &[Vec<f32>; 3],
+        gradient: &mut [f32],
+        sums: &mut [f32],
+    ) {
+        let (x, y) = (&self.x[at.clone()], &self.y[at.clone()]);
+        let weights = self.weights.map(|weights| &weights[at]);
+        let [a, b, c] = blurred.each_ref().map(|plane| &plane[..gradient.len()]);
+        for k in 0..gradient.len() {
+            let share = weights.map_or(1.0, |w| w[k]);
+            let v = y[k];
+            let u = if weights.is_some() { share * (x[k] - v) + v } else { x[k] };
+            let slope = self.l1_weight * sign(u - v);
+            gradient[k] = share * (slope - self.dssim_weight * (a[k] + 2.0 * u * b[k] + v * c[k]));
+            sums[k] += (u - v).abs();
+        }
+    }
 }
 
 /// Vertical blurs of the derivatives, the gradient, and the sums of absolute differences; without
@@ -172,47 +230,37 @@ pub(super) fn gradient(call: &mut NativeCall) -> Result<(), String> {
     let gradient = gradient.of::<f32>()[..3 * plane].par_chunks_mut(plane);
     let sums = sums.of::<f32>()[..3 * strips * width].par_chunks_mut(strips * width);
     let weights = (weighted != 0).then(|| &target[3 * plane..4 * plane]);
+    let (stride, level) = (padded(width), Level::new());
     gradient.zip(sums).enumerate().for_each(|(channel, (gradient, sums))| {
         let base = channel * plane;
+        let (x, y) = (&rendered[base..base + plane], &target[base..base + plane]);
+        let loss = Loss { x, y, weights, l1_weight, dssim_weight };
         let strips = gradient.par_chunks_mut(ROWS * width).zip(sums.par_chunks_mut(width));
         strips.enumerate().for_each(|(strip, (gradient, sums))| {
-            let count = gradient.len() / width;
-            let mut blurred: [Vec<Vec<f32>>; 3] = Default::default();
-            if with_ssim {
-                let row_of = |row: usize, k: usize| -> Vec<f32> {
-                    let at = base + row * width..base + (row + 1) * width;
-                    match k {
-                        2 => cross[at].to_vec(),
-                        k => slopes[at].iter().map(|s| s[k]).collect(),
-                    }
-                };
-                for (k, out) in blurred.iter_mut().enumerate() {
-                    let rows: Vec<_> =
-                        rows_read(strip * ROWS, height).map(|row| row.map(|row| row_of(row, k))).collect();
-                    *out = vec![vec![0.0; width]; count];
-                    blur_columns(&rows, out);
+            let length = if with_ssim { READ * stride } else { 0 };
+            let mut rows: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; length]);
+            let mut blurred: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; stride]);
+            for (i, row) in rows_read(strip, height).filter(|_| with_ssim) {
+                let at = base + row * width..base + (row + 1) * width;
+                for (k, (slope, cross)) in slopes[at.clone()].iter().zip(&cross[at]).enumerate() {
+                    rows[0][i * stride + k] = slope[0];
+                    rows[1][i * stride + k] = slope[1];
+                    rows[2][i * stride + k] = *cross;
                 }
             }
             sums.fill(0.0);
-            for k in 0..count {
+            for (k, gradient) in gradient.chunks_exact_mut(width).enumerate() {
                 let row = strip * ROWS + k;
-                let counts = (first..end).contains(&row);
-                for x in 0..width {
-                    let pixel = row * width + x;
-                    let (mut u, v) = (rendered[base + pixel], target[base + pixel]);
-                    let share = weights.map_or(1.0, |w| w[pixel]);
-                    if weights.is_some() {
-                        u = share * (u - v) + v;
-                    }
-                    let difference = u - v;
-                    let mut slope = l1_weight * sign(difference);
-                    if with_ssim {
-                        let [a, b, c] = [&blurred[0][k], &blurred[1][k], &blurred[2][k]];
-                        slope -= dssim_weight * (a[x] + 2.0 * u * b[x] + v * c[x]);
-                    }
-                    gradient[k * width + x] = if counts { share * slope } else { 0.0 };
-                    sums[x] += if counts { difference.abs() } else { 0.0 };
+                if !(first..end).contains(&row) {
+                    gradient.fill(0.0);
+                    continue;
                 }
+                dispatch!(level, simd => {
+                    for (rows, blurred) in rows.iter().zip(&mut blurred).filter(|_| with_ssim) {
+                        blur_columns(simd, rows, k, blurred);
+                    }
+                    loss.differentiate(row * width..(row + 1) * width, &blurred, gradient, sums);
+                });
             }
         });
     });

@@ -164,6 +164,16 @@ fn trained(device: &Device, degree: u32) -> Splats {
     fit_rgb(device, &images, &cameras, splats, scale, depths, &options, silent).unwrap().splats
 }
 
+/// Every pass, also those that no training step has, against its reference.
+#[test]
+fn self_check_passes_with_native_passes() {
+    let options = Options { natives: ALL, ..crate::gpu::options(None) };
+    let device = TestDevice::open(&options).unwrap();
+    let rows = crate::check::run(&device, &options, &mut |_| Ok(())).unwrap();
+    let wrong: Vec<_> = rows.iter().filter(|row| row.outcome.is_err()).collect();
+    assert!(wrong.is_empty(), "{wrong:?}");
+}
+
 #[test]
 fn training_steps_match_shaders() {
     for degree in [0, 2] {

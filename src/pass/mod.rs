@@ -30,6 +30,7 @@ pub mod sort;
 pub mod splat_buffers;
 pub mod ssim_l1;
 pub mod sum;
+mod sweep_window;
 pub mod tile_lists;
 pub mod view;
 

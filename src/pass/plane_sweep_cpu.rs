@@ -7,14 +7,15 @@
 //! over the best source views; propagation on a red-black checkerboard with adaptive candidate
 //! areas (Xu and Tao 2019, ACMM, section 3.1).
 use super::plane_sweep::{MAX_SOURCES, Matcher, ReferenceView, SourceView};
+use super::sweep_window::{OFFSETS, OUTER, Quad, Warp, Window, moments};
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep as shared;
 use crate::math::hash;
+use fearless_simd::{Level, Simd, dispatch};
 use glam::{Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 
 // Constants of glsl/shared/plane_sweep.glsl in the types of the reference.
-const TAPS: usize = shared::TAPS as usize;
 const NEIGHBOURS: usize = shared::SMOOTH_NEIGHBOURS as usize;
 const COST_LIMIT: f32 = shared::COST_LIMIT as f32;
 const VARIANCE_FLOOR: f32 = shared::VARIANCE_FLOOR as f32;
@@ -22,14 +23,6 @@ const SIGMA_COLOUR: f32 = shared::SIGMA_COLOUR as f32;
 const SIGMA_SPACE: f32 = shared::SIGMA_SPACE as f32;
 const SMOOTH_LIMIT: f32 = shared::SMOOTH_LIMIT as f32;
 const GEOMETRIC_LIMIT: f32 = shared::GEOMETRIC_LIMIT as f32;
-
-/// Taps of a window besides the middle one.
-const OUTER: usize = TAPS * TAPS - 1;
-/// Numbers that a loop over the taps handles together.
-const LANES: usize = 8;
-
-/// Luma of a pixel and of those to the right, below and diagonally below.
-type Quad = [f32; 4];
 
 /// Stream of hashed random numbers.
 pub struct Random(pub u32);
@@ -49,17 +42,6 @@ impl Random {
     }
 }
 
-/// Matching window of one reference pixel. The weights of all taps sum to 1. The middle tap is left
-/// out: in every source, values are relative to its value.
-struct Window {
-    /// Weight per outer tap.
-    weights: [f32; OUTER],
-    /// Weight × (luma − weighted mean).
-    centred: [f32; OUTER],
-    /// Weighted variance.
-    variance: f32,
-}
-
 /// Inputs of a pass.
 pub struct Inputs<'a> {
     /// Luma of all views, one after the other.
@@ -70,105 +52,6 @@ pub struct Inputs<'a> {
     sources: &'a [SourceView],
     /// The reference and the search.
     reference: ReferenceView,
-}
-
-/// Offsets of the outer taps from the middle, row by row, pixels.
-const OFFSETS: [[f32; OUTER]; 2] = {
-    let mut offsets = [[0.0; OUTER]; 2];
-    let mut k = 0;
-    while k < OUTER {
-        let tap = if k < OUTER / 2 { k } else { k + 1 };
-        let middle = (TAPS - 1) / 2;
-        offsets[0][k] = (tap % TAPS) as f32 - middle as f32;
-        offsets[1][k] = (tap / TAPS) as f32 - middle as f32;
-        offsets[0][k] *= shared::TAP_STEP as f32;
-        offsets[1][k] *= shared::TAP_STEP as f32;
-        k += 1;
-    }
-    offsets
-};
-
-/// A window in a source view: homogeneous pixel of its middle, and its change per pixel along x and
-/// y of the reference.
-struct Warp {
-    middle: Vec3,
-    along_x: Vec3,
-    along_y: Vec3,
-}
-
-/// Σ w v, Σ w v² and Σ c v over the outer taps of a warped window, with v the luma of a source
-/// relative to that at the middle tap.
-#[inline(always)]
-fn moments_of(
-    quads: &[Quad],
-    width: usize,
-    limit: [f32; 2],
-    base: f32,
-    warp: &Warp,
-    window: &Window,
-) -> [f32; 3] {
-    let Warp { middle, along_x, along_y } = *warp;
-    let (mut fx, mut fy, mut index) = ([0.0f32; OUTER], [0.0f32; OUTER], [0i32; OUTER]);
-    for k in 0..OUTER {
-        let (dx, dy) = (OFFSETS[0][k], OFFSETS[1][k]);
-        let inverse = 1.0 / (middle.z + along_x.z * dx + along_y.z * dy).max(1e-6);
-        let x = (middle.x + along_x.x * dx + along_y.x * dy) * inverse - 0.5;
-        let y = (middle.y + along_x.y * dx + along_y.y * dy) * inverse - 0.5;
-        let (x, y) = (x.max(0.0).min(limit[0]), y.max(0.0).min(limit[1]));
-        let (ix, iy) = (x as i32, y as i32);
-        (fx[k], fy[k]) = (x - ix as f32, y - iy as f32);
-        index[k] = iy * width as i32 + ix;
-    }
-    let mut corners = [[0.0f32; OUTER]; 4];
-    for k in 0..OUTER {
-        let quad = quads[index[k] as usize];
-        for c in 0..4 {
-            corners[c][k] = quad[c];
-        }
-    }
-    let mut sums = [[0.0f32; LANES]; 3];
-    for first in (0..OUTER).step_by(LANES) {
-        for lane in 0..LANES {
-            let k = first + lane;
-            let left = corners[0][k] + fy[k] * (corners[2][k] - corners[0][k]);
-            let right = corners[1][k] + fy[k] * (corners[3][k] - corners[1][k]);
-            let value = left + fx[k] * (right - left) - base;
-            sums[0][lane] += window.weights[k] * value;
-            sums[1][lane] += window.weights[k] * value * value;
-            sums[2][lane] += window.centred[k] * value;
-        }
-    }
-    sums.map(|lanes| lanes.iter().sum())
-}
-
-/// [`moments_of`] with vectors of eight numbers.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn moments_avx2(
-    quads: &[Quad],
-    width: usize,
-    limit: [f32; 2],
-    base: f32,
-    warp: &Warp,
-    window: &Window,
-) -> [f32; 3] {
-    moments_of(quads, width, limit, base, warp, window)
-}
-
-fn moments(
-    quads: &[Quad],
-    width: usize,
-    limit: [f32; 2],
-    base: f32,
-    warp: &Warp,
-    window: &Window,
-) -> [f32; 3] {
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("avx2") {
-        // SAFETY: the processor has AVX2.
-        return unsafe { moments_avx2(quads, width, limit, base, warp, window) };
-    }
-    moments_of(quads, width, limit, base, warp, window)
 }
 
 impl Inputs<'_> {
@@ -212,7 +95,15 @@ impl Inputs<'_> {
     }
 
     /// 1 − ZNCC of the window warped by `plane` into one source view, at most `COST_LIMIT`.
-    fn source_cost(&self, source: &SourceView, window: &Window, ray: Vec3, plane: Vec3) -> f32 {
+    #[inline(always)]
+    fn source_cost<S: Simd>(
+        &self,
+        simd: S,
+        source: &SourceView,
+        window: &Window,
+        ray: Vec3,
+        plane: Vec3,
+    ) -> f32 {
         let rows = source.forward.map(Vec4::from);
         let [fx, fy, ..] = self.reference.intrinsics;
         let apply = |v: Vec4| Vec3::new(rows[0].dot(v), rows[1].dot(v), rows[2].dot(v));
@@ -235,7 +126,7 @@ impl Inputs<'_> {
         let (left, right) = (top + fy * (below - top), right + fy * (diagonal - right));
         let base = left + fx * (right - left);
         let warp = Warp { middle: centre, along_x, along_y };
-        let [mean, square, covariance] = moments(quads, width as usize, limit, base, &warp, window);
+        let [mean, square, covariance] = moments(simd, quads, width as usize, limit, base, &warp, window);
         let variance = (square - mean * mean).max(0.0);
         let scale = ((window.variance + VARIANCE_FLOOR) * (variance + VARIANCE_FLOOR)).sqrt();
         (1.0 - covariance / scale).min(COST_LIMIT)
@@ -274,11 +165,20 @@ impl Inputs<'_> {
 
     /// Aggregated cost of a plane at a pixel: the sorted source costs mixed by
     /// [`shared::VIEW_SHARES`].
-    fn cost(&self, planes: &[Vec4], window: &Window, x: i32, y: i32, ray: Vec3, plane: Vec3) -> f32 {
+    #[inline(always)]
+    fn cost<S: Simd>(
+        &self,
+        simd: S,
+        planes: &[Vec4],
+        window: &Window,
+        [x, y]: [i32; 2],
+        ray: Vec3,
+        plane: Vec3,
+    ) -> f32 {
         let r = &self.reference;
         let mut best = [COST_LIMIT + r.geometric * GEOMETRIC_LIMIT; MAX_SOURCES];
         for source in &self.sources[r.first_source as usize..(r.first_source + r.sources) as usize] {
-            let mut cost = self.source_cost(source, window, ray, plane);
+            let mut cost = self.source_cost(simd, source, window, ray, plane);
             if r.geometric > 0.0 {
                 cost += r.geometric * self.geometric_error(planes, source, x, y, ray, plane);
             }
@@ -310,7 +210,8 @@ impl Inputs<'_> {
 
     /// Initial sweep at one pixel: `planes` inverse depths over the range, jittered, each with a
     /// random normal (cosine-weighted about the viewing ray). Returns the best plane and its cost.
-    pub fn sweep(&self, x: i32, y: i32) -> Vec4 {
+    #[inline(always)]
+    fn sweep<S: Simd>(&self, simd: S, x: i32, y: i32) -> Vec4 {
         let r = &self.reference;
         let ray = self.ray(x, y);
         let window = self.window(x, y);
@@ -322,7 +223,7 @@ impl Inputs<'_> {
             let inverse_depth = r.range[0] + share * (r.range[1] - r.range[0]);
             let normal = random.cube() * 0.9 - view;
             let Some(plane) = self.plane(ray, normal, inverse_depth) else { continue };
-            let cost = self.cost(&[], &window, x, y, ray, plane);
+            let cost = self.cost(simd, &[], &window, [x, y], ray, plane);
             if cost < best.w {
                 best = plane.extend(cost);
             }
@@ -359,14 +260,20 @@ impl Inputs<'_> {
     }
 
     /// One propagation and refinement step at one pixel. `planes` holds (π, cost) of all views.
-    pub fn refine(&self, planes: &[Vec4], x: i32, y: i32) -> Vec4 {
+    #[inline(always)]
+    fn refine<S: Simd>(&self, simd: S, planes: &[Vec4], x: i32, y: i32) -> Vec4 {
         let r = &self.reference;
         let own = &planes[r.first as usize..];
         let ray = self.ray(x, y);
         let window = self.window(x, y);
         let near = self.neighbours(own, x, y);
-        let total =
-            |plane: Vec3| self.cost(planes, &window, x, y, ray, plane) + self.roughness(&near, x, y, plane);
+        // A function of its own, since it is called at several places.
+        let total = |plane: Vec3| {
+            simd.vectorize(
+                #[inline(always)]
+                || self.cost(simd, planes, &window, [x, y], ray, plane) + self.roughness(&near, x, y, plane),
+            )
+        };
         let mut random = self.random(x, y);
         let current = own[(y as u32 * r.width + x as u32) as usize];
         // Re-evaluated, since a change of resolution or of the other views makes the stored cost
@@ -489,10 +396,10 @@ impl Matcher for CpuMatcher {
     fn sweep(&mut self, reference: &ReferenceView) -> Result<()> {
         let (width, first) = (reference.width as usize, reference.first as usize);
         let inputs = self.inputs(reference);
-        let pixels = width * reference.height as usize;
+        let (pixels, level) = (width * reference.height as usize, Level::new());
         let swept: Vec<Vec4> = (0..pixels)
             .into_par_iter()
-            .map(|k| inputs.sweep((k % width) as i32, (k / width) as i32))
+            .map(|k| dispatch!(level, simd => inputs.sweep(simd, (k % width) as i32, (k / width) as i32)))
             .collect();
         self.planes[first..first + pixels].copy_from_slice(&swept);
         Ok(())
@@ -504,9 +411,13 @@ impl Matcher for CpuMatcher {
         let pixels = width * reference.height as usize;
         let active: Vec<usize> = (0..pixels).filter(of_colour).collect();
         let planes = &self.planes;
+        let level = Level::new();
         let updated: Vec<Vec4> = active
             .par_iter()
-            .map(|&k| inputs.refine(planes, (k % width) as i32, (k / width) as i32))
+            .map(|&k| {
+                let (x, y) = ((k % width) as i32, (k / width) as i32);
+                dispatch!(level, simd => inputs.refine(simd, planes, x, y))
+            })
             .collect();
         for (k, plane) in active.into_iter().zip(updated) {
             self.planes[first + k] = plane;

@@ -47,9 +47,18 @@ impl NativeCall<'_> {
     /// # Errors
     /// With fewer of them.
     pub fn words<const N: usize>(&self) -> std::result::Result<[u32; N], String> {
+        self.words_from(0)
+    }
+
+    /// Push constants as words, beginning with word `first`.
+    ///
+    /// # Errors
+    /// With fewer of them.
+    pub fn words_from<const N: usize>(&self, first: usize) -> std::result::Result<[u32; N], String> {
         let words: Vec<u32> =
             self.push.chunks_exact(4).map(|b| u32::from_ne_bytes([b[0], b[1], b[2], b[3]])).collect();
-        words.get(..N).and_then(|w| w.try_into().ok()).ok_or_else(|| format!("{N} push constants expected"))
+        let own = words.get(first..first + N).and_then(|w| w.try_into().ok());
+        own.ok_or_else(|| format!("{} push constants expected", first + N))
     }
 
     /// The memory of the buffers with these binding numbers, each once.
