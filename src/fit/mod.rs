@@ -1,6 +1,7 @@
 //! Training: losses, schedules, pruning, pose refinement.
 mod added;
 mod bounds;
+mod degree_trials;
 pub mod index_head;
 pub mod init;
 mod language;

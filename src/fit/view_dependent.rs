@@ -1,5 +1,6 @@
 //! View-dependent colour (docs/internals/method.md#view-dependent-colour): spherical harmonics on a
 //! trained geometry, of the degree that left-out photos support.
+use super::degree_trials::Trials;
 use super::losses::Losses;
 use super::options::{Rates, RgbOptions};
 use super::photos::Photos;
@@ -8,7 +9,6 @@ use super::scale::SceneScale;
 use super::sh_degree::{DegreeTrial, ViewDependence};
 use crate::Result;
 use crate::gpu::Device;
-use crate::pass::renderer::Renderer;
 use crate::preset::Preset;
 use crate::progress::Progress;
 use crate::scene::{Camera, Coverage, RgbImage, Splats, sh_coefficients};
@@ -18,8 +18,6 @@ const HIGHEST: u32 = 3;
 /// Fewest photos for cross-validation: with one left out of four, three directions of a splat
 /// remain.
 const FEWEST_PHOTOS: usize = 4;
-/// Number of folds of the cross-validation. The time is proportional to it.
-const PARTS: usize = 4;
 
 /// Options of [`fit_view_dependent`].
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -70,11 +68,14 @@ pub fn fit_view_dependent(
     if most > start && (given.is_some() || images.len() >= FEWEST_PHOTOS) {
         progress.begin("view dependence", 2 + u64::from(most - start));
         if given.is_none() {
-            trials = fit.trials(images, &result.cameras, &result.splats, most)?;
+            let (cameras, splats) = (&result.cameras, &result.splats);
+            let photos = Photos { images, cameras, depths: None, coverage };
+            let near = SceneScale::measure(cameras, &splats.means).near();
+            trials = Trials { device, photos, splats, near, progress }.run(most)?;
         }
         let supported = trials.last().filter(|t: &&DegreeTrial| t.supported()).map(|t| t.degree);
         if let Some(degree) = given.or(supported) {
-            let with = fit.colours(images, &result.cameras, coverage, &result.splats, degree)?;
+            let with = fit.colours(images, &result.cameras, &result.splats, degree)?;
             (result.splats, result.stats.psnr) = (with.splats, with.stats.psnr);
         }
         progress.end();
@@ -104,7 +105,6 @@ impl Fit<'_> {
         &self,
         images: &[RgbImage],
         cameras: &[Camera],
-        coverage: &[Option<Coverage>],
         splats: &Splats,
         degree: u32,
     ) -> Result<Trained> {
@@ -125,57 +125,8 @@ impl Fit<'_> {
         };
         let scale = SceneScale::measure(cameras, &start.means);
         let quiet = Quiet(self.progress);
-        let photos = Photos { images, cameras, depths: None, coverage };
+        let photos = Photos { images, cameras, depths: None, coverage: self.coverage };
         fit_photos(self.device, photos, start, scale, &options, &quiet)
-    }
-
-    /// Tries degrees from the highest down until left-out photos support one. A degree is compared
-    /// with the colours of the splats fitted for as many steps, because they have not converged.
-    fn trials(
-        &self,
-        images: &[RgbImage],
-        cameras: &[Camera],
-        splats: &Splats,
-        most: u32,
-    ) -> Result<Vec<DegreeTrial>> {
-        let without = self.left_out_psnr(images, cameras, splats, splats.sh_degree)?;
-        let mut trials = Vec::new();
-        for degree in (splats.sh_degree + 1..=most).rev() {
-            self.progress.step(1 + trials.len() as u64, &format!("degree {degree}"));
-            let trial =
-                DegreeTrial::of(degree, &self.left_out_psnr(images, cameras, splats, degree)?, &without);
-            trials.push(trial);
-            if trial.supported() {
-                break;
-            }
-        }
-        Ok(trials)
-    }
-
-    /// PSNR of every photo with the colours fitted to the other folds, dB.
-    fn left_out_psnr(
-        &self,
-        images: &[RgbImage],
-        cameras: &[Camera],
-        splats: &Splats,
-        degree: u32,
-    ) -> Result<Vec<f64>> {
-        let mut all = vec![0.0; images.len()];
-        for part in 0..PARTS {
-            let (out, kept): (Vec<usize>, Vec<usize>) = (0..images.len()).partition(|i| i % PARTS == part);
-            let pick = |i: &usize| (images[*i].clone(), cameras[*i].clone());
-            let (images_kept, cameras_kept): (Vec<_>, Vec<_>) = kept.iter().map(pick).unzip();
-            let coverage_kept: Vec<_> =
-                kept.iter().map(|i| self.coverage.get(*i).cloned().flatten()).collect();
-            let with = self.colours(&images_kept, &cameras_kept, &coverage_kept, splats, degree)?.splats;
-            let near = SceneScale::measure(cameras, &with.means).near();
-            let mut renderer = Renderer::new(self.device, &with, &[], 0)?.with_near(near);
-            let photos = Photos { images, cameras, depths: None, coverage: self.coverage };
-            for i in out {
-                all[i] = photos.psnr(i, &renderer.render(&cameras[i])?.rgb);
-            }
-        }
-        Ok(all)
     }
 }
 

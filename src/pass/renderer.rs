@@ -2,6 +2,7 @@
 use super::bands::Band;
 use super::channels::BASE_CHANNELS;
 use super::frame::FrameBuffers;
+use super::metrics::planar;
 use super::options::RasterOptions;
 use super::rasterizer::Rasterizer;
 use super::splat_buffers::SplatBuffers;
@@ -120,26 +121,35 @@ impl Renderer {
 
     /// [N] blending weight of each splat, summed over the pixels of a view; 0 for hidden splats and
     /// those outside.
-    ///
-    /// `∂/∂c_i Σ_px C(px) = Σ_px w_i(px)`: the gradient of a loss that sums one colour channel.
     pub fn weights(&mut self, camera: &Camera) -> Result<Vec<f32>> {
+        let (width, height) = (camera.width as usize, camera.height as usize);
+        let ones = RgbImage { width, height, data: vec![[1.0; 3]; width * height] };
+        Ok(self.colour_sums(camera, &ones)?.iter().map(|sum| sum[0]).collect())
+    }
+
+    /// [N] colours of an image of this view, [H, W] RGB, summed over the pixels of each splat with
+    /// its blending weights.
+    ///
+    /// `∂/∂c_i Σ_px C(px)·a(px) = Σ_px w_i(px) a(px)`: the gradient of a loss that is linear in the
+    /// render.
+    pub fn colour_sums(&mut self, camera: &Camera, image: &RgbImage) -> Result<Vec<[f32; 3]>> {
         let options = RasterOptions { sh_degree: 0, ..self.options };
         let device = self.device.clone();
         let (rasterizer, splats) = self.prepare(camera)?;
-        let ones = vec![1f32; camera.width as usize * camera.height as usize];
+        let planes = planar(image);
         for index in 0..rasterizer.frame().bands.count() {
             let band = rasterizer.frame().bands.get(index);
             rasterizer.forward_band(splats, &options, &band)?;
-            let upstream = rasterizer.frame().bands.cut_inner(&band, &ones, 0.0);
+            let upstream = rasterizer.frame().bands.cut_inner(&band, &planes, 0.0);
             rasterizer.frame().planes_grad.write_at(0, &upstream)?;
-            let mut rec = Recorder::new(&device, "weights");
+            let mut rec = Recorder::new(&device, "colour sums");
             rasterizer.record_band_backward(&mut rec, splats, &options, &band);
             rec.run()?;
         }
         let sums = rasterizer.frame().colour_gradients(splats.count)?;
         // Cleared, because a loss on other planes would leave these values.
-        rasterizer.frame().planes_grad.write_at(0, &vec![0f32; rasterizer.frame().bands.pixels()])?;
-        Ok(sums.iter().map(|g| g[0]).collect())
+        rasterizer.frame().planes_grad.write_at(0, &vec![0f32; 3 * rasterizer.frame().bands.pixels()])?;
+        Ok(sums)
     }
 
     /// Returns a rasteriser set to the camera, and the splats.

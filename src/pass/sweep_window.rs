@@ -87,21 +87,23 @@ pub(super) fn moments<S: Simd>(
 /// The four numbers of eight quads, as four vectors.
 #[inline(always)]
 fn corners<S: Simd>(simd: S, quads: &[Quad], places: &[i32; LANES]) -> [f32x8<S>; 4] {
-    let quad = |k: usize| f32x4::simd_from(simd, quads[places[k] as usize]);
-    let transposed = |k: usize| -> [f32x4<S>; 4] {
-        let [a, b, c, d] = [quad(k), quad(k + 1), quad(k + 2), quad(k + 3)];
-        let pair =
-            |a: f32x4<S>, b: f32x4<S>| -> [f64x2<S>; 2] { [a.zip_low(b).bitcast(), a.zip_high(b).bitcast()] };
-        let ([ab, ab_high], [cd, cd_high]) = (pair(a, b), pair(c, d));
-        [
-            ab.zip_low(cd).bitcast(),
-            ab.zip_high(cd).bitcast(),
-            ab_high.zip_low(cd_high).bitcast(),
-            ab_high.zip_high(cd_high).bitcast(),
-        ]
-    };
-    let ([a, b, c, d], [e, f, g, h]) = (transposed(0), transposed(4));
+    let [a, b, c, d] = transposed(simd, quads, [places[0], places[1], places[2], places[3]]);
+    let [e, f, g, h] = transposed(simd, quads, [places[4], places[5], places[6], places[7]]);
     [a.combine(e), b.combine(f), c.combine(g), d.combine(h)]
+}
+
+#[inline(always)]
+fn transposed<S: Simd>(simd: S, quads: &[Quad], places: [i32; 4]) -> [f32x4<S>; 4] {
+    let quad = |k: usize| f32x4::simd_from(simd, quads[places[k] as usize]);
+    let (a, b, c, d) = (quad(0), quad(1), quad(2), quad(3));
+    let (ab, cd): (f64x2<S>, f64x2<S>) = (a.zip_low(b).bitcast(), c.zip_low(d).bitcast());
+    let (ab_high, cd_high): (f64x2<S>, f64x2<S>) = (a.zip_high(b).bitcast(), c.zip_high(d).bitcast());
+    [
+        ab.zip_low(cd).bitcast(),
+        ab.zip_high(cd).bitcast(),
+        ab_high.zip_low(cd_high).bitcast(),
+        ab_high.zip_high(cd_high).bitcast(),
+    ]
 }
 
 const _: () = assert!(OUTER.is_multiple_of(LANES));
