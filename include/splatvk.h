@@ -1002,7 +1002,7 @@ size_t svk_context_device_name(const SvkContext *context, char *text, size_t byt
 size_t svk_context_error(const SvkContext *context, char *text, size_t bytes);
 
 /*
- Trains a scene from 2 to 16 photos. `options` may be NULL. On failure, and when the callback
+ Trains a scene from two or more photos. `options` may be NULL. On failure, and when the callback
  stops it, `*scene` is NULL and the context keeps the error text. Thread-safe; several trainings
  may run on one context and share its device.
  */

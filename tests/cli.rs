@@ -154,8 +154,8 @@ fn train_chooses_views_and_names_them() {
 fn views_must_fit_the_photos() {
     let photos = data("breakfast/images");
     run_refuses(&[&photos], &["--views", "5"], &["--views 5", "only 4"]);
-    for views in ["0", "1", "17", "-3", "abc"] {
-        run_refuses(&[&photos], &["--views", views], &[&format!("--views {views}: "), "give 2 to 16"]);
+    for views in ["0", "1", "-3", "abc"] {
+        run_refuses(&[&photos], &["--views", views], &[&format!("--views {views}: "), "give 2 or more"]);
     }
 }
 

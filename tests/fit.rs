@@ -77,7 +77,7 @@ fn points(views: &[View]) -> PointCloud {
             cloud.positions.push(world.as_vec3().into());
             cloud.colours.push(view.image.data[i]);
             cloud.confidence.push(1.0);
-            cloud.view.push(v as u8);
+            cloud.view.push(v as u32);
             cloud.radius.push((z / view.camera.fx) as f32);
         }
     }

@@ -24,7 +24,7 @@ const MOST_ROW_BYTES: u64 = 1 << 32;
 /// Maximum of bytes of a photo's file: as uncompressed 32-bit floats of the most pixels.
 const MOST_ENCODED_BYTES: u64 = 16 * MAX_PIXELS;
 
-/// Trains a scene from 2 to 16 photos. `options` may be NULL. On failure, and when the callback
+/// Trains a scene from two or more photos. `options` may be NULL. On failure, and when the callback
 /// stops it, `*scene` is NULL and the context keeps the error text. Thread-safe; several trainings
 /// may run on one context and share its device.
 #[unsafe(no_mangle)]

@@ -128,7 +128,8 @@ pub struct TrainArgs {
     /// of them; their lenses are taken out of the photos
     #[arg(long, value_name = "FILE")]
     pub cameras: PathBuf,
-    /// How many of the photos with a camera are used [default: all, at most 16]
+    /// How many of the photos with a camera are used [default: all
+    /// that fit into memory]
     #[arg(long, value_name = "N")]
     pub views: Option<usize>,
     /// Start from the points of this .ply or COLMAP model instead of stereo

@@ -4,7 +4,6 @@ use super::kept::report_kept_stages;
 use super::print::{ending, print, print_json};
 use super::progress;
 use crate::infer::installed::{Inventory, inventory};
-use crate::photo::MAX_VIEWS;
 use crate::run::base;
 use crate::run::method::SPARSELGS;
 use crate::run::sources::{FeatureSources, MaskSources, MatchSources, SourceChoice, SourceKind, choose};
@@ -29,7 +28,7 @@ pub struct RunArgs {
     pub queries: Vec<String>,
     /// How many photos to use: sharp ones that overlap, from different places [default: all, at
     /// most 4]
-    #[arg(long, value_name = "N", value_parser = views())]
+    #[arg(long, value_name = "N", value_parser = whole::<usize>(2..))]
     pub views: Option<usize>,
     /// Add the photos to this scene, made by run, instead of making one of their own; without
     /// --out, the larger scene stands beside it under the next number, and the old one stays
@@ -50,10 +49,6 @@ pub struct RunArgs {
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
-}
-
-fn views() -> impl Fn(&str) -> std::result::Result<usize, String> + Clone + Send + Sync {
-    whole(2..=MAX_VIEWS as u64)
 }
 
 pub fn run(args: &RunArgs) -> Result<()> {

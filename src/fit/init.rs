@@ -113,15 +113,18 @@ fn occupied(
         let p = points.positions[i].map(|v| (v / cell).floor() as i64);
         [octave as i64, p[0], p[1], p[2]]
     };
-    let voxels: Vec<Voxel> = candidates.par_iter().map(voxel).collect();
     let mut best = HashMap::default();
-    for (&i, voxel) in candidates.iter().zip(voxels) {
-        let entry = best.entry(voxel).or_insert(i);
-        if confidence(i) > confidence(*entry) {
-            *entry = i;
-        }
-        if best.len() > most {
-            return None;
+    // In parts, since too small an edge shows after few of many candidates.
+    for part in candidates.chunks(1 << 16) {
+        let voxels: Vec<Voxel> = part.par_iter().map(voxel).collect();
+        for (&i, voxel) in part.iter().zip(voxels) {
+            let entry = best.entry(voxel).or_insert(i);
+            if confidence(i) > confidence(*entry) {
+                *entry = i;
+            }
+            if best.len() > most {
+                return None;
+            }
         }
     }
     Some(best)

@@ -54,6 +54,12 @@ impl Rates {
 /// beside the photos lose 0.8 dB; the photos gain 0.4 dB.
 const OPACITY: Option<f64> = Some(1.5);
 
+/// Photos from which on steps and splats grow with their number.
+const MANY_PHOTOS: usize = 16;
+/// Most splats that continue the surfaces beyond one photo's border; the border of a photo among many
+/// is mostly within others.
+const UNSEEN_PER_PHOTO: usize = 15_000;
+
 /// Options of [`super::train_rgb`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct RgbOptions {
@@ -66,6 +72,8 @@ pub struct RgbOptions {
     /// Reach of continued surfaces beyond the photo borders, in units of the longer image side
     /// (needs depth maps); 0 = no surface is continued, also behind depth edges.
     pub margin: f64,
+    /// Most splats of continued surfaces, those next to the ends of surfaces first.
+    pub most_unseen: usize,
     /// Learning rates.
     pub rates: Rates,
     /// Blending weight, pixels, below which the colour of a splat hardly moves.
@@ -104,11 +112,26 @@ impl RgbOptions {
         }
     }
 
-    /// Limits the final number of splats to `most`; `planned` is the number without a limit,
-    /// including splats beyond the photo borders.
-    pub fn limit_splats(&mut self, most: usize, planned: usize) {
-        let beyond = planned.saturating_sub(self.init.max_points);
-        self.init.max_points = self.init.max_points.min(most.saturating_sub(beyond));
+    /// These options for a number of photos. Of more than [`MANY_PHOTOS`], each is used as often,
+    /// and adds as many splats, as of that many.
+    pub fn for_photos(self, photos: usize) -> Self {
+        let grown = |n: usize| n.max(n * photos / MANY_PHOTOS);
+        let mut options = self.clone().with_iterations(grown(self.iterations));
+        options.init.max_points = grown(options.init.max_points);
+        options.most_unseen = UNSEEN_PER_PHOTO * photos.min(MANY_PHOTOS / 2);
+        options
+    }
+
+    /// Most splats, of surfaces that photos show and of continued ones.
+    pub fn most_splats(&self) -> usize {
+        self.init.max_points + if self.margin > 0.0 { self.most_unseen } else { 0 }
+    }
+
+    /// Limits the number of splats to `most`.
+    pub fn limit_splats(&mut self, most: usize) {
+        self.most_unseen = self.most_unseen.min(most / 3);
+        let shown = most - if self.margin > 0.0 { self.most_unseen } else { 0 };
+        self.init.max_points = self.init.max_points.min(shown);
     }
 
     /// These options for another number of steps; schedules end with the run.
@@ -124,12 +147,10 @@ impl RgbOptions {
         self
     }
 
-    /// These options for continuing a scene of `known` photos with `new` more: each new photo may
-    /// add its share of the splats.
+    /// These options, of all photos, for continuing a scene of `known` photos with `new` more: each
+    /// new photo may add its share of the splats.
     pub fn for_continuation(self, known: usize, new: usize) -> Self {
-        // With many photos, each is used as often as in a run with sixteen.
-        let steps = self.iterations.max(self.iterations * (known + new) / 16);
-        let mut options = RgbOptions { virtual_views: 0, ..self.with_iterations(steps) };
+        let mut options = RgbOptions { virtual_views: 0, ..self };
         options.init.max_points = (options.init.max_points * new).div_ceil((known + new).max(1));
         options
     }
@@ -198,6 +219,7 @@ impl RgbOptions {
                 thickness: 1.0,
             },
             margin: 0.0,
+            most_unseen: UNSEEN_PER_PHOTO * MANY_PHOTOS / 2,
             rates: Rates {
                 means: Exponential { start: 1.6e-4, end: 1.6e-6, steps: 30_000 },
                 log_scales: 5e-3,
@@ -301,6 +323,25 @@ impl LanguageOptions {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn steps_and_splats_grow_with_many_photos() {
+        let few = RgbOptions::preset(Preset::Draft);
+        for photos in [2, MANY_PHOTOS] {
+            let options = few.clone().for_photos(photos);
+            assert_eq!(options.iterations, few.iterations);
+            assert_eq!(options.init, few.init);
+        }
+        let many = few.clone().for_photos(100);
+        assert_eq!(many.iterations, few.iterations * 100 / MANY_PHOTOS);
+        assert_eq!(many.rates.means.steps, many.iterations, "the schedule ends with the run");
+        assert_eq!(many.init.max_points, few.init.max_points * 100 / MANY_PHOTOS);
+        // Continued surfaces leave most of a small device to the surfaces that photos show.
+        let mut limited = many;
+        limited.limit_splats(120_000);
+        assert_eq!(limited.most_splats(), 120_000);
+        assert!(limited.init.max_points >= 80_000);
+    }
 
     #[test]
     fn with_iterations_stretches_the_schedules() {

@@ -98,17 +98,9 @@ impl BaseScene {
         }
     }
 
-    /// Refuses too many photos, and names that the scene already has.
+    /// Refuses names that the scene already has.
     pub fn check(&self, new: &[Photo]) -> Result<()> {
         let all: Vec<Photo> = self.known.photos.iter().chain(new).cloned().collect();
-        if all.len() > photo::MAX_VIEWS {
-            return Err(Error::input(format!(
-                "{} photos in the scene and {} more; a scene has at most {}",
-                self.known.photos.len(),
-                new.len(),
-                photo::MAX_VIEWS
-            )));
-        }
         // Lens and light were taken out of the scene's photos, so the name identifies a photo.
         let is_known = |p: &&Photo| self.known.photos.iter().any(|k| k.stem == p.stem);
         if let Some(again) = new.iter().find(is_known) {

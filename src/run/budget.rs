@@ -30,9 +30,6 @@ const HOST_BASE: u64 = 300 << 20;
 const STEREO_VIEWS: u64 = MAX_SOURCES as u64 + 1;
 /// Share of a device's memory that buffers may fill: drivers keep some, and allocations leave gaps.
 const HEAP_SHARE: f64 = 0.9;
-/// Splats that continue the surfaces beyond one photo's border, at most (`src/fit/unseen`).
-const MARGIN: usize = 15_000;
-
 /// Memory limits of a machine.
 #[derive(Clone, Debug)]
 pub struct Limits {
@@ -60,6 +57,12 @@ pub struct MemoryDemand {
     pub virtual_views: usize,
 }
 
+/// Options of the colour stage for a number of photos; the paper's do not depend on it.
+pub fn rgb_options(preset: Preset, photos: usize) -> RgbOptions {
+    let options = RgbOptions::preset(preset);
+    if preset == Preset::Paper { options } else { options.for_photos(photos) }
+}
+
 impl MemoryDemand {
     /// Demand of a run with codes of this length; `per_level` trains the levels one after the
     /// other.
@@ -70,9 +73,8 @@ impl MemoryDemand {
 
     /// Demand of a run without language.
     pub fn colour(preset: Preset, photos: usize) -> MemoryDemand {
-        let options = RgbOptions::preset(preset);
-        let margin = if options.margin > 0.0 { MARGIN * photos } else { 0 };
-        let (splats, virtual_views) = (options.init.max_points + margin, options.virtual_views);
+        let options = rgb_options(preset, photos);
+        let (splats, virtual_views) = (options.most_splats(), options.virtual_views);
         MemoryDemand { features: 0, splats, virtual_views }
     }
 }
@@ -195,34 +197,63 @@ fn gib(bytes: u64) -> f64 {
     bytes as f64 / f64::from(1 << 30)
 }
 
-/// Refuses a working size that does not fit, and names the largest that does. `originals` are the
-/// (width, height) of the photos.
-pub fn check(
-    limits: &Limits,
-    originals: &[(usize, usize)],
-    max_size: usize,
-    work: &MemoryDemand,
-) -> Result<()> {
-    let scaled_to = |size: usize| -> Vec<(usize, usize)> {
-        originals.iter().map(|&(w, h)| working_size(w, h, size)).collect()
-    };
-    let Some(reason) = obstacle(limits, &scaled_to(max_size), work) else { return Ok(()) };
-    let longest = originals.iter().map(|s| s.0.max(s.1)).max().unwrap_or(0).min(max_size);
-    let fits = |size: usize| obstacle(limits, &scaled_to(size), work).is_none();
-    if longest <= SMALLEST_SIDE || !fits(SMALLEST_SIDE) {
-        return Err(Error::input(format!(
-            "{} photos are too many for this machine: {reason}",
-            originals.len()
-        )));
+/// Sizes of the photos at a working size.
+fn scaled(originals: &[(usize, usize)], max_size: usize) -> Vec<(usize, usize)> {
+    originals.iter().map(|&(w, h)| working_size(w, h, max_size)).collect()
+}
+
+/// The largest value from `least` on, below `most`, that `fits`; `None` where `least` does not.
+fn largest_fitting(least: usize, most: usize, fits: impl Fn(usize) -> bool) -> Option<usize> {
+    if least >= most || !fits(least) {
+        return None;
     }
-    let (mut fitting, mut too_large) = (SMALLEST_SIDE, longest);
+    let (mut fitting, mut too_large) = (least, most);
     while too_large - fitting > 1 {
         let middle = fitting + (too_large - fitting) / 2;
         if fits(middle) { fitting = middle } else { too_large = middle }
     }
-    Err(Error::input(format!(
-        "photos of {longest} pixels are too large for this machine: {reason}; the largest that works is --max-size {fitting}"
-    )))
+    Some(fitting)
+}
+
+/// Number of photos of these (width, height) that fit, whichever they are. `work` is the demand of
+/// a number of photos.
+pub fn most_photos(
+    limits: &Limits,
+    originals: &[(usize, usize)],
+    max_size: usize,
+    work: impl Fn(usize) -> MemoryDemand,
+) -> usize {
+    let mut sizes = scaled(originals, max_size);
+    sizes.sort_by_key(|s| std::cmp::Reverse(pixels(s)));
+    let fits = |count: usize| obstacle(limits, &sizes[..count], &work(count)).is_none();
+    largest_fitting(0, sizes.len() + 1, |count| count == 0 || fits(count)).unwrap_or(0)
+}
+
+/// Refuses a working size that does not fit, and names the largest size and number of photos that
+/// do. `originals` are the (width, height) of the photos, `work` the demand of a number of them.
+pub fn check(
+    limits: &Limits,
+    originals: &[(usize, usize)],
+    max_size: usize,
+    work: impl Fn(usize) -> MemoryDemand,
+) -> Result<()> {
+    let count = originals.len();
+    let demand = work(count);
+    let obstacle_at = |size: usize| obstacle(limits, &scaled(originals, size), &demand);
+    let Some(reason) = obstacle_at(max_size) else { return Ok(()) };
+    let longest = originals.iter().map(|s| s.0.max(s.1)).max().unwrap_or(0).min(max_size);
+    let fewer = most_photos(limits, originals, max_size, work);
+    let fewer = (fewer >= 2).then(|| format!("--views {fewer}"));
+    let smaller = largest_fitting(SMALLEST_SIDE, longest, |size| obstacle_at(size).is_none());
+    let smaller = smaller.map(|size| format!("--max-size {size}"));
+    let ways: Vec<String> = fewer.into_iter().chain(smaller).collect();
+    Err(Error::input(match ways.as_slice() {
+        [] => format!("{count} photos are too many for this machine: {reason}"),
+        ways => format!(
+            "{count} photos of {longest} pixels are too large for this machine: {reason}; the largest that works is {}",
+            ways.join(" or ")
+        ),
+    }))
 }
 
 /// Maximum number of splats that the device binds with this many features. The two moments of the
@@ -254,34 +285,47 @@ mod tests {
 
     #[test]
     fn budget_names_largest_fitting_size() {
-        let work = MemoryDemand::language(16, false, Preset::Draft, 4);
-        assert!(check(&limits(4), &PHOTOS, 800, &work).is_ok());
-        let e = check(&limits(4), &PHOTOS, 4032, &work).unwrap_err();
+        let work = |photos| MemoryDemand::language(16, false, Preset::Draft, photos);
+        assert!(check(&limits(4), &PHOTOS, 800, work).is_ok());
+        let e = check(&limits(4), &PHOTOS, 4032, work).unwrap_err();
         assert_eq!(e.exit_code(), 2);
         let message = e.to_string();
         let named: usize = message.rsplit(' ').next().unwrap().parse().unwrap();
         assert!((800..4032).contains(&named), "{message}");
-        assert!(check(&limits(4), &PHOTOS, named, &work).is_ok());
-        assert!(check(&limits(4), &PHOTOS, named + 1, &work).is_err());
-        assert!(check(&limits(1), &PHOTOS, 800, &work).unwrap_err().to_string().contains("GiB"));
+        assert!(check(&limits(4), &PHOTOS, named, work).is_ok());
+        assert!(check(&limits(4), &PHOTOS, named + 1, work).is_err());
+        assert!(check(&limits(1), &PHOTOS, 800, work).unwrap_err().to_string().contains("GiB"));
+    }
+
+    #[test]
+    fn budget_names_largest_number_of_photos() {
+        let work = |photos| MemoryDemand::colour(Preset::Draft, photos);
+        let many = [PHOTOS[0]; 300];
+        let fitting = most_photos(&limits(8), &many, 800, work);
+        assert!((5..300).contains(&fitting), "{fitting}");
+        assert!(check(&limits(8), &many[..fitting], 800, work).is_ok());
+        let message = check(&limits(8), &many[..fitting + 1], 800, work).unwrap_err().to_string();
+        assert!(message.contains(&format!("works is --views {fitting} or --max-size ")), "{message}");
+        assert_eq!(most_photos(&limits(1000), &many, 800, work), 300);
+        assert_eq!(most_photos(&limits(0), &many, 800, work), 0);
     }
 
     #[test]
     fn budget_refuses_images_wider_than_bands() {
-        let work = MemoryDemand::language(16, false, Preset::Draft, 2);
+        let work = |photos| MemoryDemand::language(16, false, Preset::Draft, photos);
         let wide = [(40_000, 2000); 2];
-        let message = check(&limits(1000), &wide, 40_000, &work).unwrap_err().to_string();
+        let message = check(&limits(1000), &wide, 40_000, work).unwrap_err().to_string();
         assert!(message.contains("pixels wide") && message.contains("--max-size"), "{message}");
-        assert!(check(&limits(1000), &wide, 8000, &work).is_ok());
+        assert!(check(&limits(1000), &wide, 8000, work).is_ok());
     }
 
     #[test]
     fn budget_limits_gpu_to_its_memory() {
         let mut limits = limits(1000);
         (limits.device.is_cpu, limits.device.memory) = (false, 2 << 30);
-        let work = MemoryDemand::language(16, false, Preset::Default, 4);
-        assert!(check(&limits, &PHOTOS, 1600, &work).is_ok());
+        let work = |photos| MemoryDemand::language(16, false, Preset::Default, photos);
+        assert!(check(&limits, &PHOTOS, 1600, work).is_ok());
         let many = [(4032, 3024); 16];
-        assert!(check(&limits, &many, 4032, &work).unwrap_err().to_string().contains("which has 2.0"));
+        assert!(check(&limits, &many, 4032, work).unwrap_err().to_string().contains("which has 2.0"));
     }
 }

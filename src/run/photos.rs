@@ -27,9 +27,16 @@ pub(super) fn load(
     if has_cameras {
         photo::assign_masks(&mut files, &masks(plan)?, progress)?;
     }
-    // Without language a photo costs little memory.
-    let most = plan.config.language.is_none().then(|| files.len().min(photo::MAX_VIEWS));
-    let wanted = photo::photo_count(files.len(), plan.inputs.views.or(most))?;
+    let views = match plan.inputs.views {
+        None if plan.config.language.is_none() => {
+            let fitting = plan.config.most_photos(device, &photo::sizes_of(&files), max_size);
+            let most = if has_cameras { fitting } else { photo::DEFAULT_VIEWS_WITHOUT_LANGUAGE };
+            // Where not even two fit, the check below states the reason.
+            Some(files.len().min(most.max(2)))
+        }
+        views => views,
+    };
+    let wanted = photo::photo_count(files.len(), views)?;
     let mut choice = None;
     if wanted < files.len() {
         let (chosen, made) = choose::choose(&files, wanted, progress)?;

@@ -44,8 +44,9 @@ pub struct Inputs {
     pub photos: Vec<PathBuf>,
     /// A scene directory that the photos join, instead of making a scene of their own.
     pub add: Option<PathBuf>,
-    /// Number of photos to use; `None`: all, at most [`crate::photo::DEFAULT_VIEWS`], or
-    /// [`crate::photo::MAX_VIEWS`] for a scene without language.
+    /// Number of photos to use; `None`: at most [`crate::photo::DEFAULT_VIEWS`], and for a scene
+    /// without language all with a known camera that fit into memory, or
+    /// [`crate::photo::DEFAULT_VIEWS_WITHOUT_LANGUAGE`].
     pub views: Option<usize>,
     /// Folder of a mask per photo; `None` = one beside the photos, where there is any.
     pub photo_masks: Option<PathBuf>,
@@ -168,8 +169,14 @@ impl ReconstructionConfig {
         sizes: &[(usize, usize)],
         max_size: usize,
     ) -> Result<()> {
-        let work = self.memory_demand(self.preset_on(device), sizes.len());
-        budget::check(&budget::Limits::now(device.info()), sizes, max_size, &work)
+        let work = |photos| self.memory_demand(self.preset_on(device), photos);
+        budget::check(&budget::Limits::now(device.info()), sizes, max_size, work)
+    }
+
+    /// Number of photos of these (width, height) for which the machine has the memory.
+    pub(super) fn most_photos(&self, device: &Device, sizes: &[(usize, usize)], max_size: usize) -> usize {
+        let work = |photos| self.memory_demand(self.preset_on(device), photos);
+        budget::most_photos(&budget::Limits::now(device.info()), sizes, max_size, work)
     }
 
     fn memory_demand(&self, preset: Preset, photos: usize) -> budget::MemoryDemand {
@@ -186,9 +193,9 @@ impl ReconstructionConfig {
 
     /// The colour stage.
     pub(super) fn rgb_options(&self, preset: Preset, device: &Device, photos: usize) -> RgbOptions {
-        let mut options = RgbOptions::preset(preset);
+        let mut options = budget::rgb_options(preset, photos);
         let demand = self.memory_demand(preset, photos);
-        options.limit_splats(budget::most_splats(device.info(), demand.features), demand.splats);
+        options.limit_splats(budget::most_splats(device.info(), demand.features));
         options.seed = self.training.seed;
         if let Some(n) = self.training.iterations {
             options = options.with_iterations(n);

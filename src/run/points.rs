@@ -65,7 +65,7 @@ fn with_footprints(cloud: PointCloud, cameras: &[Camera], progress: &dyn Progres
             kept.positions.push(cloud.positions[i]);
             kept.colours.push(cloud.colours[i]);
             kept.confidence.push(cloud.confidence[i]);
-            kept.view.push(view as u8);
+            kept.view.push(view as u32);
             kept.radius.push(radius);
         }
     }

@@ -209,6 +209,7 @@ impl<T: Pod> Buffer<T> {
         if start == end {
             return Ok(());
         }
+        self.0.device.0.transfers.read((end - start) as u64);
         let fetched = self.0.host.get().filter(|_| self.0.fetched.load(Ordering::Acquire));
         for mapped in [Some(self.cast()), fetched.cloned()].into_iter().flatten() {
             if let Some(memory) = lock(&mapped.0.block).as_ref().and_then(Block::bytes) {
@@ -236,6 +237,7 @@ impl<T: Pod> Buffer<T> {
         if bytes.is_empty() {
             return Ok(());
         }
+        self.0.device.0.transfers.written(bytes.len() as u64);
         if let Some(memory) = lock(&self.0.block).as_mut().and_then(Block::bytes_mut) {
             memory[range.start as usize..range.end as usize].copy_from_slice(bytes);
             return Ok(());

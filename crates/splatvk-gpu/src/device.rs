@@ -2,6 +2,7 @@
 use crate::Result;
 use crate::cache::{Cache, Driver};
 use crate::compile_time::CompileTime;
+use crate::counts::Transfers;
 use crate::error::vk_error;
 use crate::executor::Executor;
 use crate::info::DeviceInfo;
@@ -53,6 +54,7 @@ pub(crate) struct Inner {
     pub owned: bool,
     pub heap: Heap,
     submissions: AtomicU64,
+    pub transfers: Transfers,
     /// Runs programs instead of the queue, in tests.
     pub stand_in: Option<Box<dyn Executor>>,
     /// Native code in place of shaders.
@@ -134,6 +136,7 @@ impl Device {
             owned,
             heap,
             submissions: AtomicU64::new(0),
+            transfers: Transfers::default(),
             stand_in: None,
             natives: if on_processor { setup.natives } else { &[] },
             #[cfg(feature = "testing")]

@@ -70,6 +70,7 @@ mod call;
 mod choice;
 mod command;
 mod compile_time;
+mod counts;
 mod device;
 mod enabled;
 mod error;
@@ -105,6 +106,7 @@ pub use call::Call;
 #[cfg(feature = "testing")]
 pub use command::{Groups, Op};
 pub use compile_time::on_long_compilation;
+pub use counts::WorkCounts;
 pub use device::{Device, QueueLock};
 pub use enabled::EnabledFeatures;
 pub use error::{Error, Result, VulkanError};

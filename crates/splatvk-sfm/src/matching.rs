@@ -1,7 +1,8 @@
 //! Keypoints, descriptor matching, and the image area where keypoints may lie.
 use crate::photo::PlainBorder;
 use crate::scene::{Coverage, Image, RgbImage};
-use glam::{DVec2, Vec4};
+use glam::DVec2;
+use nalgebra::{DMatrix, DMatrixView, DMatrixViewMut};
 use rayon::prelude::*;
 
 /// Keypoints with unit descriptors of one photo.
@@ -13,6 +14,18 @@ pub struct Keypoints {
     pub dim: usize,
     /// [N, dim] unit rows.
     pub descriptors: Vec<f32>,
+}
+
+impl Keypoints {
+    /// The first `count` keypoints.
+    pub(crate) fn first(&self, count: usize) -> Keypoints {
+        let count = count.min(self.points.len());
+        Keypoints {
+            points: self.points[..count].to_vec(),
+            dim: self.dim,
+            descriptors: self.descriptors[..count * self.dim].to_vec(),
+        }
+    }
 }
 
 /// Keypoint detector for images at working size, such as a network.
@@ -53,18 +66,14 @@ impl Nearest {
     }
 }
 
-/// `a·b` of descriptors whose length is a multiple of 8, in eight sums.
-fn dot(a: &[f32], b: &[f32]) -> f32 {
-    let (a, b) = (a.as_chunks::<8>().0, b.as_chunks::<8>().0);
-    // glam vectors and plain loops are fast in debug builds, too, where iterators took half of the
-    // time of camera estimation.
-    let mut sums = [Vec4::ZERO; 2];
-    for i in 0..a.len() {
-        let ([a0, a1, a2, a3, a4, a5, a6, a7], [b0, b1, b2, b3, b4, b5, b6, b7]) = (a[i], b[i]);
-        sums[0] += Vec4::new(a0, a1, a2, a3) * Vec4::new(b0, b1, b2, b3);
-        sums[1] += Vec4::new(a4, a5, a6, a7) * Vec4::new(b4, b5, b6, b7);
-    }
-    sums.map(|s| s.to_array()).as_flattened().iter().sum()
+/// Similarities [M, N] of the descriptors `rows`, [M, dim], to those of another photo, the rows of
+/// an [N, dim] matrix.
+fn similarities(rows: &[f32], others: &DMatrix<f32>, out: &mut [f32]) {
+    let (n, dim) = others.shape();
+    let m = rows.len() / dim;
+    // nalgebra's matrices are column-major: a slice of rows is the transposed matrix.
+    let rows = DMatrixView::from_slice(rows, dim, m);
+    DMatrixViewMut::from_slice(out, n, m).gemm(1.0, others, &rows, 0.0);
 }
 
 /// Nearest neighbours of `a` in `b`, and of `b` in `a`. Similarities are computed once, for some
@@ -74,20 +83,25 @@ fn nearest(a: &Keypoints, b: &Keypoints) -> (Vec<Nearest>, Vec<Nearest>) {
     const ROWS: usize = 256;
     // Enough parts for every core, and each fits its L1 cache.
     const COLUMNS: usize = 512;
+    // Rows of a task: enough work for a matrix product.
+    const TASK: usize = 64;
     let (dim, columns) = (a.dim, b.points.len());
     let (mut forward, mut backward) = (vec![Nearest::NONE; a.points.len()], vec![Nearest::NONE; columns]);
-    let mut similarities = vec![0f32; ROWS.min(a.points.len()) * columns];
+    let others = DMatrix::from_row_slice(columns, dim, &b.descriptors);
+    let mut block_similarities = vec![0f32; ROWS.min(a.points.len()) * columns];
     for (block, (found, rows)) in forward.chunks_mut(ROWS).zip(a.descriptors.chunks(ROWS * dim)).enumerate() {
-        let similarities = &mut similarities[..found.len() * columns];
-        let outputs = similarities.par_chunks_mut(columns).zip(found);
-        outputs.zip(rows.par_chunks(dim)).for_each(|((similarities, found), row)| {
-            for k in 0..columns {
-                similarities[k] = dot(row, &b.descriptors[k * dim..(k + 1) * dim]);
-                found.consider(k, similarities[k], &b.points);
+        let block_similarities = &mut block_similarities[..found.len() * columns];
+        let outputs = block_similarities.par_chunks_mut(TASK * columns).zip(found.par_chunks_mut(TASK));
+        outputs.zip(rows.par_chunks(TASK * dim)).for_each(|((out, found), rows)| {
+            similarities(rows, &others, out);
+            for (found, similarities) in found.iter_mut().zip(out.chunks_exact(columns)) {
+                for (k, similarity) in similarities.iter().enumerate() {
+                    found.consider(k, *similarity, &b.points);
+                }
             }
         });
         backward.par_chunks_mut(COLUMNS).enumerate().for_each(|(part, found)| {
-            for (row, similarities) in similarities.chunks_exact(columns).enumerate() {
+            for (row, similarities) in block_similarities.chunks_exact(columns).enumerate() {
                 let similarities = &similarities[part * COLUMNS..];
                 for k in 0..found.len() {
                     found[k].consider(block * ROWS + row, similarities[k], &a.points);
@@ -99,10 +113,9 @@ fn nearest(a: &Keypoints, b: &Keypoints) -> (Vec<Nearest>, Vec<Nearest>) {
 }
 
 /// Mutual nearest neighbours whose distance is below `ratio` of the distance to the second-best
-/// elsewhere, best first. Descriptor lengths must be multiples of 8 and equal; otherwise there are
-/// no matches.
+/// elsewhere, best first. Descriptors of unequal lengths have no matches.
 pub(crate) fn mutual_matches(a: &Keypoints, b: &Keypoints, ratio: f32) -> Vec<Match> {
-    if a.dim != b.dim || !a.dim.is_multiple_of(8) || a.points.is_empty() || b.points.is_empty() {
+    if a.dim != b.dim || a.dim == 0 || a.points.is_empty() || b.points.is_empty() {
         return Vec::new();
     }
     let (forward, backward) = nearest(a, b);
@@ -245,8 +258,8 @@ mod tests {
 
     #[test]
     fn nearest_equals_plain_search() {
-        // More rows than a block, more columns than a part.
-        let (a, b) = (random_keypoints(600, 1), random_keypoints(1100, 2));
+        // More rows than a block, the last task of few rows; more columns than a part.
+        let (a, b) = (random_keypoints(578, 1), random_keypoints(1100, 2));
         let plain = |from: &Keypoints, to: &Keypoints| -> Vec<(usize, f32)> {
             let rows = from.descriptors.chunks_exact(16);
             rows.map(|row| {

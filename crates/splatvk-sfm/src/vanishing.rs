@@ -37,10 +37,15 @@ pub(super) struct LogFocal {
     pub(super) sigma: f64,
 }
 
+/// Most photos of a camera whose edges are used: [`SHARED`] bounds the gain of more.
+const MAX_PHOTOS: usize = 8;
+
 /// Estimates ln (f / long side) of photos of one camera, from those with a σ up to [`SHARP`];
-/// `None` without any. `prior` is on the same quantity; the result includes it.
+/// `None` without any. Of many photos some are used, in even steps. `prior` is on the same quantity; the result includes it.
 pub(super) fn log_focal<'a>(images: impl Iterator<Item = &'a RgbImage>, prior: LogFocal) -> Option<LogFocal> {
-    let images: Vec<&RgbImage> = images.collect();
+    let all: Vec<&RgbImage> = images.collect();
+    let count = all.len().min(MAX_PHOTOS);
+    let images: Vec<&RgbImage> = (0..count).map(|k| all[k * all.len() / count]).collect();
     let sharp = |image: &&RgbImage| Edges::of(image).log_focal(prior).filter(|f| f.sigma <= SHARP);
     combined(&images.par_iter().filter_map(sharp).collect::<Vec<_>>())
 }

@@ -54,12 +54,13 @@ pub(super) fn continued_surfaces(photos: &Photos, options: &RgbOptions) -> Splat
     }
     let (reach, confidence) = (options.margin, options.min_confidence);
     let beside = views_beside(photos, confidence, options.seed);
-    unseen_splats(images, cameras, depths, &beside, reach, confidence, options.seed)
+    unseen_splats(images, cameras, depths, &beside, reach, confidence, options.most_unseen, options.seed)
 }
 
 /// Creates flat splats around all photos and behind their depth edges, up to `reach` times the
 /// longer side from the end of a surface. None stands before a surface that a photo shows, neither
-/// from the photos nor from the views `beside` them. Depth below `min_confidence` is ignored.
+/// from the photos nor from the views `beside` them. Depth below `min_confidence` is ignored. Of more
+/// than `most`, those nearest to the ends of surfaces are kept.
 fn unseen_splats(
     images: &[RgbImage],
     cameras: &[Camera],
@@ -67,6 +68,7 @@ fn unseen_splats(
     beside: &[(Camera, DepthMap)],
     reach: f64,
     min_confidence: f32,
+    most: usize,
     seed: u64,
 ) -> Splats {
     let sky = Sky::of(cameras, depths);
@@ -97,6 +99,9 @@ fn unseen_splats(
     let mut taken = HashSet::new();
     let mut splats = Splats::default();
     for c in &all {
+        if splats.len() == most {
+            break;
+        }
         let size = c.steps[0].length().min(c.steps[1].length()).max(1e-12);
         let octave = size.log2().round();
         let cell = (c.position / (octave.exp2())).floor().as_i64vec3();
@@ -288,7 +293,7 @@ mod tests {
         let n = DVec3::new(0.1, -0.3, 1.0).normalize();
         let (image, depth) = scene(n, 3.0);
         let known = depth.clone();
-        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, 0);
+        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, usize::MAX, 0);
         // 32 px around 160 × 120 on a grid of 2.4 px is about 3100 cells (rounded corners).
         assert!(splats.len() > 2500, "{}", splats.len());
         let mut off = 0;
@@ -318,7 +323,7 @@ mod tests {
             depth.depth.data[i] *= 0.6;
             image.data[i] = [0.9, 0.1, 0.1];
         }
-        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, 0);
+        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, usize::MAX, 0);
         let mut behind = 0;
         for (mean, sh) in splats.means.iter().zip(splats.sh.chunks(3)) {
             let p = DVec3::from(mean.map(f64::from));
@@ -358,7 +363,7 @@ mod tests {
         // A wall above and a nearer one below row 60: beyond the left border both continue, since
         // the nearer one may end.
         let (image, depth) = walls(|_, y| if y < 60 { (3.0, [0.2; 3]) } else { (1.8, [0.8; 3]) });
-        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, 0);
+        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, usize::MAX, 0);
         let below: Vec<_> = places(&splats)
             .into_iter()
             .filter(|(p, ..)| (-20.0..-1.0).contains(&p.x) && (63.0..75.0).contains(&p.y))
@@ -377,7 +382,7 @@ mod tests {
             (20..60, true) => (1.5, [0.9, 0.1, 0.1]),
             _ => (3.0, [0.5; 3]),
         });
-        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, 0);
+        let splats = unseen_splats(&[image], &[camera()], &[depth], &[], 0.2, 0.5, usize::MAX, 0);
         let left: Vec<_> = places(&splats).into_iter().filter(|(p, ..)| p.x < -1.0).collect();
         assert!(left.len() > 500, "{}", left.len());
         for (pixel, z, red) in left {
@@ -396,7 +401,7 @@ mod tests {
         }
         let sky = Sky::of(&[camera()], std::slice::from_ref(&depth)).unwrap();
         assert!((sky.radius - 30.0).abs() < 1e-3, "{}", sky.radius);
-        let splats = unseen_splats(&[image], &[camera()], &[depth.clone()], &[], 0.2, 0.5, 0);
+        let splats = unseen_splats(&[image], &[camera()], &[depth.clone()], &[], 0.2, 0.5, usize::MAX, 0);
         let far: Vec<_> = places(&splats).into_iter().filter(|(_, z, _)| *z > 15.0).collect();
         assert!(far.len() > 100, "beyond the borders it continues");
         let inside = |p: &DVec2| (0.0..160.0).contains(&p.x) && (0.0..120.0).contains(&p.y);
@@ -420,7 +425,8 @@ mod tests {
         let (images, depths): (Vec<_>, Vec<_>) = photos.into_iter().unzip();
         let cameras = [camera(), above];
         let risen = |photos: usize| {
-            let splats = unseen_splats(&images[..photos], &cameras, &depths[..photos], &[], 0.2, 0.5, 0);
+            let splats =
+                unseen_splats(&images[..photos], &cameras, &depths[..photos], &[], 0.2, 0.5, usize::MAX, 0);
             let wall =
                 |(p, z, _): &&(DVec2, f64, f32)| (40.0..120.0).contains(&p.x) && p.y < -6.0 && *z < 3.0;
             places(&splats).iter().filter(wall).count()
@@ -451,9 +457,9 @@ mod tests {
         };
         let (images, depths) = ([image.clone(), image], [depth, farther]);
         let cameras = [camera(), beside];
-        let alone = unseen_splats(&images[..1], &cameras, &depths[..1], &[], 0.2, 0.5, 0);
+        let alone = unseen_splats(&images[..1], &cameras, &depths[..1], &[], 0.2, 0.5, usize::MAX, 0);
         assert!(before(&alone, &cameras[1], &depths[1]) > 100, "the first photo alone knows no better");
-        let splats = unseen_splats(&images, &cameras, &depths, &[], 0.2, 0.5, 0);
+        let splats = unseen_splats(&images, &cameras, &depths, &[], 0.2, 0.5, usize::MAX, 0);
         assert!(splats.len() > 1000);
         for (camera, depth) in cameras.iter().zip(&depths) {
             assert_eq!(before(&splats, camera, depth), 0);

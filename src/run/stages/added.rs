@@ -119,7 +119,7 @@ impl Stage for AddedDepth {
         }
         let new: Vec<_> = (count..all).map(|v| (&model.cameras[v], &depths[v], &rendered[v])).collect();
         let mut points = fit::new_surface(&dense.points, &new);
-        points.view.iter_mut().for_each(|v| *v = views[usize::from(*v)] as u8);
+        points.view.iter_mut().for_each(|v| *v = views[*v as usize] as u32);
         Ok(Geometry {
             cameras: model.cameras.clone(),
             points,

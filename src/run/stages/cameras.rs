@@ -173,7 +173,7 @@ fn without_unused(mut geometry: Geometry, photos: &[Photo]) -> Geometry {
 
 /// Whether a point projects to a used pixel of its photo.
 fn is_used_point(geometry: &Geometry, photos: &[Photo], point: usize) -> bool {
-    let view = usize::from(geometry.points.view[point]);
+    let view = geometry.points.view[point] as usize;
     let (Some(photo), Some(camera)) = (photos.get(view), geometry.cameras.get(view)) else { return true };
     let (pixel, _) = camera.project(glam::DVec3::from(geometry.points.positions[point].map(f64::from)));
     let (w, h) = (photo.image.width, photo.image.height);

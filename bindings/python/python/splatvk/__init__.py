@@ -84,7 +84,7 @@ def reconstruct(photos, *, out=None, views=None, queries=(), language=True, prog
     Parameters
     ----------
     photos : path, sequence of paths, or sequence of arrays
-        Photos, folders of photos, or a video; or 2 to 16 arrays (H, W, 3) of sRGB pixels, uint8, or
+        Photos, folders of photos, or a video; or at least two arrays (H, W, 3) of sRGB pixels, uint8, or
         float32 in [0, 1].
     out : path
         The scene directory. It is written whole or not at all; `force=True` replaces a scene. Only

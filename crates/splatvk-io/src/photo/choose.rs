@@ -5,12 +5,12 @@ use crate::error::words;
 use crate::{Error, Result, files};
 use std::path::{Component, Path, PathBuf};
 
-/// Largest number of views: the number of pairs grows with its square, and the method is made for a
-/// few photos.
-pub const MAX_VIEWS: usize = 16;
-
-/// Default number of views where more photos are given (docs/internals/method.md#choice-of-photos).
+/// Default number of views of a scene with language where more photos are given
+/// (docs/internals/method.md#choice-of-photos).
 pub const DEFAULT_VIEWS: usize = 4;
+
+/// Default number of views of a scene without language whose cameras are unknown.
+pub const DEFAULT_VIEWS_WITHOUT_LANGUAGE: usize = 16;
 
 /// Photos of the inputs, and ignored files of the folders.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -137,7 +137,7 @@ fn nothing(inputs: &[PathBuf], found: &FoundFiles) -> Error {
             )
         }
         None => {
-            format!("{place}: no photos; give a folder with 2 to {MAX_VIEWS} photos ({READ}), or a video")
+            format!("{place}: no photos; give a folder with 2 or more photos ({READ}), or a video")
         }
         Some(raw) if is_raw_name(raw) => {
             format!(
@@ -227,11 +227,6 @@ pub fn photo_count(count: usize, views: Option<usize>) -> Result<usize> {
             "--views {wanted}: only {count} photos were given; add photos or lower --views"
         )));
     }
-    if wanted > MAX_VIEWS {
-        return Err(Error::input(format!(
-            "--views {wanted}: at most {MAX_VIEWS} views are supported; lower --views"
-        )));
-    }
     Ok(wanted)
 }
 
@@ -308,7 +303,8 @@ mod tests {
         assert_eq!(photo_count(20, None).unwrap(), DEFAULT_VIEWS);
         assert_eq!(photo_count(3, None).unwrap(), 3);
         assert_eq!(photo_count(20, Some(6)).unwrap(), 6);
-        for (n, views) in [(3, 4), (3, 1), (3, 0), (20, 17)] {
+        assert_eq!(photo_count(400, Some(300)).unwrap(), 300);
+        for (n, views) in [(3, 4), (3, 1), (3, 0)] {
             let e = photo_count(n, Some(views)).unwrap_err();
             assert!(e.exit_code() == 2 && e.to_string().starts_with(&format!("--views {views}:")), "{e}");
         }

@@ -33,7 +33,9 @@ mod xmp;
 
 pub use border::PlainBorder;
 pub use candidate::{Candidate, gather};
-pub use choose::{DEFAULT_VIEWS, FoundFiles, MAX_VIEWS, find, find_named, photo_count, spread};
+pub use choose::{
+    DEFAULT_VIEWS, DEFAULT_VIEWS_WITHOUT_LANGUAGE, FoundFiles, find, find_named, photo_count, spread,
+};
 pub use decode::stored_pixels;
 pub use header::dimensions;
 pub use join::{join, plain_name, stems_apart};
@@ -232,18 +234,15 @@ fn have_equal_pictures(a: &Photo, b: &Photo) -> bool {
 /// Refuses sets that cannot give geometry (one photo, or the same photo twice) or with ambiguous
 /// names (the same name twice). Included in [`load_all`]; for photos from memory.
 pub fn check_set(photos: &[Photo]) -> Result<()> {
-    if !(2..=MAX_VIEWS).contains(&photos.len()) {
-        return Err(match photos {
-            [] => Error::input("no photos; at least 2 are needed, 3 or 4 work best"),
-            [one] => Error::input(format!(
+    match photos {
+        [] => return Err(Error::input("no photos; at least 2 are needed, 3 or 4 work best")),
+        [one] => {
+            return Err(Error::input(format!(
                 "{}: only one photo; at least 2 are needed, 3 or 4 work best",
                 one.path.display()
-            )),
-            all => Error::input(format!(
-                "{} photos are more than a scene takes; give at most {MAX_VIEWS}, or --views {MAX_VIEWS} to have them chosen",
-                all.len()
-            )),
-        });
+            )));
+        }
+        _ => {}
     }
     // The stem of a photo may be prefixed by its folders.
     photos.iter().try_for_each(|p| check_name(&p.path).and_then(|()| check_name(p.stem.as_ref())))?;

@@ -214,7 +214,7 @@ fn fuse(views: &[ModelView], layers: &[Layer]) -> PointCloud {
             cloud.positions.push(world.as_vec3().to_array());
             cloud.colours.push(view.image.at(x, y));
             cloud.confidence.push(l.confidence[k] as f32);
-            cloud.view.push(v as u8);
+            cloud.view.push(v as u32);
             cloud.radius.push((l.depth[k] / l.camera.fx) as f32);
         }
     }

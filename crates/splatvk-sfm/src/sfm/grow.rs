@@ -21,6 +21,10 @@ pub(super) fn seed_score(pair: &Pair) -> f64 {
     pair.geometry.inliers.len() as f64 * (pair.geometry.parallax / 10.0).min(1.0)
 }
 
+/// Of a model with n adjusted views, n over this number of further ones are registered without an
+/// adjustment: none of a few photos, and the errors of few views do not add up.
+const ADJUSTED_SHARE: usize = 8;
+
 /// Registers all views, starting from the pair `seed`. `empty` holds centres, camera ids,
 /// intrinsics and priors; `threshold` in pixels.
 pub(super) fn grow(
@@ -37,6 +41,7 @@ pub(super) fn grow(
     model.triangulate_all(2.0 * threshold);
     adjust_and_triangulate(&mut model, threshold);
     let views = model.poses.len();
+    let mut adjusted = 2;
     loop {
         let unregistered: Vec<usize> = (0..views).filter(|v| model.poses[*v].is_none()).collect();
         if unregistered.is_empty() {
@@ -58,7 +63,11 @@ pub(super) fn grow(
             },
         }
         model.triangulate_all(2.0 * threshold);
-        adjust_and_triangulate(&mut model, threshold);
+        let registered = views + 1 - unregistered.len();
+        if registered == views || registered > adjusted + adjusted / ADJUSTED_SHARE {
+            adjust_and_triangulate(&mut model, threshold);
+            adjusted = registered;
+        }
     }
     Ok(model)
 }

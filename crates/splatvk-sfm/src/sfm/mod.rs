@@ -9,6 +9,7 @@ mod grow;
 mod intrinsics;
 mod known;
 mod model;
+mod neighbours;
 mod pair;
 mod patch;
 mod refine;

@@ -134,6 +134,10 @@ pub(super) struct Model {
 /// Least triangulation angle of a usable point: below it the depth is mostly noise.
 pub(super) const MIN_ANGLE_DEGREES: f64 = 1.0;
 
+/// Most pairs of observations that a track of many is triangulated from. If half of the
+/// observations are wrong, a quarter of the pairs are right.
+const MAX_PAIRS: usize = 28;
+
 impl Model {
     pub(super) fn focal(&self, view: usize) -> f64 {
         self.intrinsics[self.camera_ids[view]].focal * self.zoom[view]
@@ -343,14 +347,17 @@ impl Model {
 
     /// Position from the pair of observations that most others agree with.
     fn triangulate_best_pair(&self, elements: &[TrackElement], threshold: f64) -> Option<DVec3> {
+        let registered: Vec<&TrackElement> =
+            elements.iter().filter(|s| self.poses[s.view].is_some()).collect();
+        let pairs: Vec<(usize, usize)> =
+            (0..registered.len()).flat_map(|i| (0..i).map(move |j| (j, i))).collect();
+        let count = pairs.len().min(MAX_PAIRS);
         let mut best: Option<(usize, DVec3)> = None;
-        for i in 0..elements.len() {
-            for j in 0..i {
-                let Some(x) = self.triangulate(&[elements[j], elements[i]], threshold) else { continue };
-                let support = elements.iter().filter(|o| self.reprojection_error(o, x) < threshold).count();
-                if best.is_none_or(|b| support > b.0) {
-                    best = Some((support, x));
-                }
+        for (j, i) in (0..count).map(|k| pairs[k * pairs.len() / count]) {
+            let Some(x) = self.triangulate(&[*registered[j], *registered[i]], threshold) else { continue };
+            let support = registered.iter().filter(|o| self.reprojection_error(o, x) < threshold).count();
+            if best.is_none_or(|b| support > b.0) {
+                best = Some((support, x));
             }
         }
         best.map(|b| b.1)

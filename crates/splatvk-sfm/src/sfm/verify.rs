@@ -1,6 +1,7 @@
 //! Descriptor matches between pairs of photos, and their geometric verification.
 use super::detectors::{DetectorFeatures, affine_features};
 use super::model::Model;
+use super::neighbours;
 use super::pair::{Matches, Pair, components, is_sure};
 use super::tracks::KeypointMatch;
 use super::unregistered::Unregistered;
@@ -48,14 +49,9 @@ impl TwoViewGeometry {
     }
 }
 
-/// All pairs (i < j), in order.
-fn pairs_of(n: usize) -> Vec<(usize, usize)> {
-    (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j))).collect()
-}
-
 /// Matches and verified pairs of photos.
 pub(super) struct VerifiedMatches {
-    /// Matches of all pairs by descriptor.
+    /// Matches by descriptor.
     pub(super) putative: Vec<Matches>,
     pub(super) pairs: Vec<Pair>,
 }
@@ -159,7 +155,7 @@ fn unsure_pairs(
     between.map(|(k, _)| k).collect()
 }
 
-/// Descriptor matches between all views.
+/// Descriptor matches of [`neighbours::pairs`].
 pub(super) fn putative_matches(
     photos: &[Photo],
     detectors: &[DetectorFeatures],
@@ -171,8 +167,7 @@ pub(super) fn putative_matches(
         drop_static_matches(photos, &mut pair);
         pair
     };
-    let views = detectors.first().map_or(0, |f| f.keypoints.len());
-    let out = pairs_of(views).into_par_iter().map(pair).collect();
+    let out = neighbours::pairs(detectors).into_par_iter().map(pair).collect();
     progress.check()?;
     Ok(out)
 }

@@ -159,7 +159,7 @@ impl<'a> View<'a> {
         let (pixel, point) = ([x as f32 + 0.5, y as f32 + 0.5], ray / inverse);
         let visibility =
             |surface, other| self.poses.visibility(self.level, surface, self.view, other, pixel, point);
-        (0..self.level.cameras.len()).filter(|other| *other != self.view).any(|other| {
+        self.level.neighbours(self.view).any(|other| {
             // Filled depth of another view is no proof of free space, but mostly right: a wrong
             // plane seldom has its colour there by chance.
             visibility(self.known, other) == Visibility::FreeSpace

@@ -242,7 +242,7 @@ impl<'a> ViewFill<'a> {
         let ray = self.ray(k);
         let point = ray / plane.dot(ray);
         let mut evidence = (1.0, 0.0);
-        for other in (0..self.level.cameras.len()).filter(|&o| o != self.view) {
+        for other in self.level.neighbours(self.view) {
             let pixel = [x as f32 + 0.5, y as f32 + 0.5];
             match self.poses.visibility(self.level, self.surface, self.view, other, pixel, point) {
                 Visibility::FreeSpace => evidence.1 = FREE_SPACE_COST,

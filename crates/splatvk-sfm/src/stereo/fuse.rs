@@ -64,7 +64,8 @@ fn fuse_view(
             }
         }
     };
-    for (other, points) in kept {
+    let compared: Vec<usize> = level.neighbours(view).chain([view]).collect();
+    for (other, points) in kept.iter().filter(|(other, _)| compared.contains(other)) {
         points.par_iter().with_min_len(1024).for_each(|point| cover(*other, *point));
     }
     let is_sky = |k: usize| sky[r.first as usize + k];
@@ -88,7 +89,7 @@ fn fuse_view(
         cloud.positions.push(to_world.transform(point.as_dvec3()).as_vec3().to_array());
         cloud.colours.push(level.guide[view].data[k]);
         cloud.confidence.push(confidence);
-        cloud.view.push(view as u8);
+        cloud.view.push(view as u32);
         let pixels = if is_sky(k) { SKY_STEP as f32 } else { 1.0 };
         cloud.radius.push(pixels * z / r.intrinsics[0]);
         let normal = to_world.rotation * surface.planes[r.first as usize + k].as_dvec3();

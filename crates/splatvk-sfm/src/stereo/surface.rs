@@ -194,7 +194,6 @@ pub fn consistent_surface(
             .map(|(p, v)| if *v || p.w > COST_TOLERANCE { 0.0 } else { 1.0 })
             .collect(),
     };
-    let views = level.cameras.len();
     // In the second round only confirmed pixels confirm or contradict.
     for round in 0..2 {
         surface.confidence = map_pixels(level, |view, x, y, k| {
@@ -207,7 +206,7 @@ pub fn consistent_surface(
                 return 0.0;
             }
             let (mut agree, mut against) = (0usize, 0usize);
-            for other in (0..views).filter(|&o| o != view) {
+            for other in level.neighbours(view) {
                 let pixel = [x as f32 + 0.5, y as f32 + 0.5];
                 match poses.visibility(level, &surface, view, other, pixel, ray / inverse) {
                     Visibility::Agrees => agree += 1,
@@ -247,7 +246,7 @@ fn with_plausible(
             return 0.0;
         }
         let pixel = [x as f32 + 0.5, y as f32 + 0.5];
-        let against = (0..level.cameras.len()).filter(|&o| o != view).any(|o| {
+        let against = level.neighbours(view).any(|o| {
             poses.visibility(level, confirmed, view, o, pixel, ray / inverse) == Visibility::FreeSpace
         });
         if against { 0.0 } else { PLAUSIBLE }

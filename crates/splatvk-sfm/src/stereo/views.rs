@@ -4,6 +4,7 @@ use super::matcher::{MAX_SOURCES, ReferenceView, SourceView, binding};
 use crate::scene::{Camera, RgbImage};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3, Vec4};
+use rayon::prelude::*;
 
 /// All views at one resolution.
 #[derive(Clone, Debug)]
@@ -20,7 +21,12 @@ pub struct Level {
     pub references: Vec<ReferenceView>,
     /// Relative depth difference below which two depths of a view agree, one per view.
     pub tolerance: Vec<f32>,
+    /// Per view the views whose depth is compared with its own, ascending.
+    pub compared: Vec<Vec<usize>>,
 }
+
+/// Most views whose depth is compared with that of a view: of those that share most with it.
+const COMPARED: usize = 16;
 
 /// Relative difference below which depths agree: several times the matching noise, far below the
 /// size of objects.
@@ -70,21 +76,25 @@ pub fn pyramid(
     }
     let ranges: Vec<[f64; 2]> =
         cameras.iter().map(|c| inverse_depth_range(c, sparse)).collect::<Result<_>>()?;
-    let chosen: Vec<Vec<usize>> = (0..cameras.len())
-        .map(|view| choose_sources(view, cameras, sparse, options.sources.clamp(1, MAX_SOURCES)))
-        .collect();
+    let mut compared: Vec<Vec<usize>> =
+        (0..cameras.len()).into_par_iter().map(|view| neighbours(view, cameras, sparse)).collect();
+    let sources = options.sources.clamp(1, MAX_SOURCES);
+    let chosen: Vec<Vec<usize>> =
+        compared.iter().map(|all| all.iter().copied().take(sources).collect()).collect();
+    compared.iter_mut().for_each(|all| all.sort_unstable());
+    let compared = &compared;
     let tolerance: Vec<f32> = (0..cameras.len()).map(|v| tolerance(v, cameras, &chosen[v], sparse)).collect();
     let mut guide = images.to_vec();
     while bound_bytes(&guide, &chosen) as u64 > options.binding {
         guide = guide.iter().map(halved).collect();
     }
-    let mut levels = vec![level(&guide, cameras, &chosen, &ranges, &tolerance)];
+    let mut levels = vec![level(&guide, cameras, &chosen, compared, &ranges, &tolerance)];
     while levels.len() < options.rounds.len().max(1) {
         if guide.iter().any(|l| l.width.min(l.height) / 2 < SMALLEST_SIDE) {
             break;
         }
         guide = guide.iter().map(halved).collect();
-        levels.push(level(&guide, cameras, &chosen, &ranges, &tolerance));
+        levels.push(level(&guide, cameras, &chosen, compared, &ranges, &tolerance));
     }
     levels.reverse();
     Ok(levels)
@@ -130,9 +140,10 @@ pub fn in_image(camera: &Camera, p: DVec3) -> bool {
     z > 0.0 && pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x < w && pixel.y < h
 }
 
-/// Best source views of a view: many shared points at angles of 5–60° (optimum 20°, as in COLMAP's
-/// and MVSNet's view selection; smaller angles have no parallax, larger ones no common appearance).
-fn choose_sources(view: usize, cameras: &[Camera], sparse: &[DVec3], count: usize) -> Vec<usize> {
+/// Up to [`COMPARED`] source views of a view, best first: many shared points at angles of 5–60°
+/// (optimum 20°, as in COLMAP's and MVSNet's view selection; smaller angles have no parallax, larger
+/// ones no common appearance).
+fn neighbours(view: usize, cameras: &[Camera], sparse: &[DVec3]) -> Vec<usize> {
     let here = cameras[view].pose.centre();
     let mut scores: Vec<(f64, usize)> = (0..cameras.len())
         .filter(|&other| other != view)
@@ -150,7 +161,7 @@ fn choose_sources(view: usize, cameras: &[Camera], sparse: &[DVec3], count: usiz
         })
         .collect();
     scores.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-    scores.into_iter().take(count).map(|(_, other)| other).collect()
+    scores.into_iter().take(COMPARED).map(|(_, other)| other).collect()
 }
 
 /// Half the size, 2 × 2 means; an odd last row or column is dropped.
@@ -170,6 +181,7 @@ fn level(
     guide: &[RgbImage],
     cameras: &[Camera],
     chosen: &[Vec<usize>],
+    compared: &[Vec<usize>],
     ranges: &[[f64; 2]],
     tolerance: &[f32],
 ) -> Level {
@@ -211,7 +223,15 @@ fn level(
         sources.extend(chosen[view].iter().map(|&other| source_view(camera, &cameras[other], first[other])));
     }
     let luma = guide.iter().flat_map(|g| g.luma().data).map(rounded_to_16_bits).collect();
-    Level { cameras, guide: guide.to_vec(), luma, sources, references, tolerance: tolerance.to_vec() }
+    Level {
+        cameras,
+        guide: guide.to_vec(),
+        luma,
+        sources,
+        references,
+        tolerance: tolerance.to_vec(),
+        compared: compared.to_vec(),
+    }
 }
 
 /// Rounds as the shaders' 16-bit input, so that the CPU reference computes the same.
@@ -244,6 +264,11 @@ fn source_view(reference: &Camera, other: &Camera, first: u32) -> SourceView {
 }
 
 impl Level {
+    /// Views whose depth is compared with that of a view.
+    pub(super) fn neighbours(&self, view: usize) -> impl Iterator<Item = usize> + '_ {
+        self.compared[view].iter().copied()
+    }
+
     /// Pixels of all views together.
     pub fn pixels(&self) -> usize {
         self.luma.len()

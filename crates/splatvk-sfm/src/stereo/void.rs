@@ -72,6 +72,7 @@ mod tests {
             luma: Vec::new(),
             sources: Vec::new(),
             tolerance: Vec::new(),
+            compared: Vec::new(),
         };
         let share = (0..12 * 8).map(|i| if i % 12 < 4 { 0.0 } else { 1.0 }).collect();
         let coverage =

@@ -11,7 +11,7 @@ pub struct PointCloud {
     /// [N] confidence > 0.
     pub confidence: Vec<f32>,
     /// [N] index of the view of each point.
-    pub view: Vec<u8>,
+    pub view: Vec<u32>,
     /// [N] footprint of one pixel at the point's depth, `z / f`, world units.
     pub radius: Vec<f32>,
     /// [N, 3] unit normal of the surface, world axes, of either sign; zero where it is not known,

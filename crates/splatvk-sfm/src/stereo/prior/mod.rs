@@ -184,7 +184,7 @@ impl PriorFusion<'_> {
     fn in_free_space(&self, x: usize, y: usize, inverse: f32) -> bool {
         let point = ray(self.level, self.view, x, y) / inverse;
         let pixel = [x as f32 + 0.5, y as f32 + 0.5];
-        (0..self.level.cameras.len()).filter(|&o| o != self.view).any(|other| {
+        self.level.neighbours(self.view).any(|other| {
             let seen = self.poses.visibility(self.level, self.surface, self.view, other, pixel, point);
             seen == Visibility::FreeSpace
         })

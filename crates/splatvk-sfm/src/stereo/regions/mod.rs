@@ -134,7 +134,7 @@ fn without_contradicted(level: &Level, poses: &RelativePoses, surface: &Surface)
         }
         let ray = ray(level, view, x, y);
         let (point, pixel) = (ray / surface.planes[k].dot(ray), [x as f32 + 0.5, y as f32 + 0.5]);
-        let votes = (0..level.cameras.len()).filter(|&o| o != view).map(|other| {
+        let votes = level.neighbours(view).map(|other| {
             match poses.visibility(level, surface, view, other, pixel, point) {
                 Visibility::Agrees => 1,
                 Visibility::FreeSpace => -1,
@@ -371,7 +371,7 @@ impl<'a> View<'a> {
     /// True if a point of the camera's frame at pixel `k` lies in another view's free space.
     fn point_in_free_space(&self, poses: &RelativePoses, surface: &Surface, k: usize, point: Vec3) -> bool {
         let pixel = [(k % self.width) as f32 + 0.5, (k / self.width) as f32 + 0.5];
-        (0..self.level.cameras.len()).filter(|&o| o != self.view).any(|other| {
+        self.level.neighbours(self.view).any(|other| {
             let seen = poses.visibility(self.level, surface, self.view, other, pixel, point);
             seen == Visibility::FreeSpace
         })
