@@ -241,7 +241,7 @@ mod tests {
     fn device_search_equals_host_search() {
         let device = test_device();
         check(&device, &[[97, 71], [97, 71], [33, 130], [8, 5], [1, 1]], &[12, 8, 4]);
-        check(&device, &[[41, 36]], &[300]);
+        check(&device, &[[41, 36]], &[2, 300]);
         assert_eq!(MOST, MOST_LEVELS as usize);
     }
 

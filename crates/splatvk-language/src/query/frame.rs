@@ -240,16 +240,32 @@ pub(super) fn blended(sum: u32) -> f32 {
     (f64::from(sum) * SCALE) as f32
 }
 
-/// Largest sum of 900 times the value of a pixel and of its box. A pixel of value 0 has at most 900
-/// times the largest value, which a pixel of that value reaches: others need not be searched.
+/// Largest sum of 900 times the value of a pixel and of its box. A sum of the box is at most 900 times
+/// the largest value, so that codes whose value is too small for the peak of the best code need not
+/// be searched: often a part of the frame is enough.
 fn peak(maps: &CodeMaps, level: usize, table: &Table, bands: usize) -> u32 {
     let map = &maps.levels[level];
-    let Some(part) = map.part_of(|code| table.at(code) > 0) else { return 0 };
+    let top = map.shown.iter().map(|s| table.at(s.code.into())).max().unwrap_or(0);
+    let Some(best) = map.part_of(|code| top > 0 && table.at(code) == top) else { return 0 };
+    let highest = peak_in(maps, level, table, &best, bands);
+    let rivals = map.shown.iter().filter(|s| {
+        let value = table.at(s.code.into());
+        value > 0 && AREA * (value + top) > highest && !best.contains(&s.part)
+    });
+    match rivals.map(|s| s.part.clone()).reduce(|a, b| a.joined(&b)) {
+        Some(rest) => highest.max(peak_in(maps, level, table, &rest, bands)),
+        None => highest,
+    }
+}
+
+/// [`peak`] of a part.
+fn peak_in(maps: &CodeMaps, level: usize, table: &Table, part: &Part, bands: usize) -> u32 {
+    let codes = &maps.levels[level].codes;
     let bands: Vec<Part> = part.bands(bands, LEAST_ROWS).collect();
     let width = maps.width;
     let search = |band: &Part| {
         let mut highest = 0;
-        let fill = |y: usize, x: usize, row: &mut [u32]| table.gather(&map.codes[y * width + x..], row);
+        let fill = |y: usize, x: usize, row: &mut [u32]| table.gather(&codes[y * width + x..], row);
         box_rows((width, maps.height), band, fill, |_, _, values, sums| {
             let row = values.iter().zip(sums).map(|(v, s)| AREA * v + s).fold(0, u32::max);
             highest = highest.max(row);

@@ -4,6 +4,7 @@
 //! [`MOST_LEVELS`] levels are exact in 32 bits, so that they do not depend on their order: parts of
 //! a frame, threads and devices give the same bits.
 use super::filter::{BOX, reflect_101};
+use fearless_simd::{Level, Simd, dispatch};
 use std::ops::Range;
 
 /// Number of the relevancy 1. Rounding moves a relevancy by at most 5e-7; the sum of 900 pixels of
@@ -41,6 +42,12 @@ impl Part {
     pub fn joined(self, other: &Part) -> Part {
         let both = |a: Range<usize>, b: &Range<usize>| a.start.min(b.start)..a.end.max(b.end);
         Part { x: both(self.x, &other.x), y: both(self.y, &other.y) }
+    }
+
+    /// Whether all pixels of another part are in this one.
+    pub fn contains(&self, other: &Part) -> bool {
+        let within = |a: &Range<usize>, b: &Range<usize>| a.start <= b.start && b.end <= a.end;
+        within(&self.x, &other.x) && within(&self.y, &other.y)
     }
 
     /// Divides the rows into at most `count` parts of at least `least` rows.
@@ -84,6 +91,18 @@ impl Axis {
 /// its values and their box sums from column `x` on. `fill(y, x, row)` writes the values of row `y`
 /// from column `x` on. Near a border the part grows by up to half a box.
 pub fn box_rows(
+    size: (usize, usize),
+    part: &Part,
+    fill: impl FnMut(usize, usize, &mut [u32]),
+    visit: impl FnMut(usize, usize, &[u32], &[u32]),
+) {
+    // Compiled once per set of vector instructions, with `fill` and `visit` inlined.
+    dispatch!(Level::new(), simd => box_rows_with(simd, size, part, fill, visit));
+}
+
+#[inline(always)]
+fn box_rows_with<S: Simd>(
+    _: S,
     size: (usize, usize),
     part: &Part,
     mut fill: impl FnMut(usize, usize, &mut [u32]),
