@@ -23,7 +23,12 @@ pub fn search(device: &Device) {
         let mut tables =
             |count: usize| Table::new(&(0..count).map(|_| random.uniform() as f32).collect::<Vec<_>>());
         let tables = [tables(codes), tables(3)];
-        let answering = vec![vec![vec![0, 2, 5], vec![1]], vec![vec![1], Vec::new()]];
+        let shown = |frame: &Arc<CodeMaps>, level: usize| {
+            let list = frame.levels[level].shown.iter().map(|s| s.code);
+            list.step_by(3).collect::<Vec<u16>>()
+        };
+        let answering =
+            vec![vec![shown(&frames[0], 0), shown(&frames[0], 1)], vec![shown(&frames[1], 0), Vec::new()]];
         let mut search = DeviceSearch::new(device, &frames, codes).unwrap().unwrap();
         let found = search.search(&tables, &answering).unwrap();
         assert_eq!(found, HostSearch(&frames).search(&tables, &answering).unwrap());

@@ -67,8 +67,8 @@ pub struct LevelPeaks {
 
 /// Finds the peaks of all levels of frames at once: a device that keeps the maps of the frames.
 pub trait FrameSearch {
-    /// Per frame and level the peaks of a query: relevancy per level, and the codes that answer per
-    /// frame and level, ascending. A level without codes has an empty table and default peaks.
+    /// Per frame and level the peaks of a query: relevancy per level, and the shown codes that answer
+    /// per frame and level, ascending. A level without codes has an empty table and default peaks.
     fn search(&mut self, tables: &[Table], answering: &[Vec<Vec<u16>>]) -> Result<Vec<Vec<LevelPeaks>>>;
 }
 
