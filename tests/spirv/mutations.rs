@@ -75,6 +75,7 @@ fn scene_of(family: &str, module: &Module) -> Scene {
         "ssim_rows_shared" => "ssim and l1",
         "camera_sum" => "gradients by entry",
         "fused_update" => "fused update",
+        "query_peaks" => "text query",
         "project_backward" if module.variant[1] == 0 => "SH gradients per thread",
         "project_backward" => "SH gradients in shared memory",
         other => panic!("no scene is known to run the barriers of {other}"),
