@@ -1,7 +1,7 @@
 #version 450
 // Text query, pass 1 of 2: sums over the 30 rows of the box of each pixel, of the excess per level
-// and of the relevancy of all levels. One thread makes a strip of STRIP rows of one column by running
-// sums. Reference: query::frame::HostSearch.
+// and of the relevancy of all levels. One thread makes a strip of STRIP rows of one column by
+// running sums. Reference: query::frame::HostSearch.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 64) in;

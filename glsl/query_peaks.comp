@@ -1,7 +1,7 @@
 #version 450
 // Text query, pass 2 of 2: sums over the 30 columns of the box, and per level the largest blended
-// excess and the pixel of an answering code with the largest relevancy of all levels in its box. One
-// thread makes RUN pixels of a row, a workgroup the largest of its threads. Reference:
+// excess and the pixel of an answering code with the largest relevancy of all levels in its box.
+// One thread makes RUN pixels of a row, a workgroup the largest of its threads. Reference:
 // query::frame::HostSearch.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -10,8 +10,8 @@ layout(local_size_x = 128) in;
 layout(std430, binding = 0) readonly buffer Codes { uint codes[]; };
 layout(std430, binding = 1) readonly buffer Tables { uint tables[]; };
 layout(std430, binding = 2) readonly buffer Columns { uint columns[]; };
-// [frames, levels, workgroups] largest of 900 times the excess of a pixel and of its box; largest sum
-// of relevancy with its pixel, NONE without an answering code.
+// [frames, levels, workgroups] largest of 900 times the excess of a pixel and of its box; largest
+// sum of relevancy with its pixel, NONE without an answering code.
 layout(std430, binding = 3) writeonly buffer Found { uvec4 found[]; };
 layout(push_constant) uniform Push { uint width; uint height; uint levels; uint slots; };
 #include "shared/query.glsl"
