@@ -1,6 +1,6 @@
 #version 450
 // Text query, pass 1 of 2: sums over the 30 rows of the box of each pixel, of the excess per level
-// and of the relevancy of all levels. One thread makes a strip of STRIP rows of one column by
+// and of the relevancy of all levels. One thread makes a strip of ROWS rows of one column by
 // running sums. Reference: query::frame::HostSearch.
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
@@ -13,13 +13,13 @@ layout(std430, binding = 2) writeonly buffer Columns { uint columns[]; };
 layout(push_constant) uniform Push { uint width; uint height; uint levels; uint slots; };
 #include "shared/query.glsl"
 
-const int STRIP = 16;
+const int ROWS = 16;
 
-uint excess[MOST_LEVELS], all_levels;
+uint excess[SUMMED_LEVELS], all_levels;
 
 // Adds a row to the sums, or subtracts it where the sign is -1 modulo 2^32.
 void add(uint frame, uint pixel, uint sign) {
-    [[unroll]] for (uint level = 0u; level < MOST_LEVELS; level++) {
+    [[unroll]] for (uint level = 0u; level < SUMMED_LEVELS; level++) {
         if (level < levels) {
             uint entry = entry_of(frame * levels + level, pixel);
             excess[level] += sign * excess_of(entry);
@@ -31,16 +31,16 @@ void add(uint frame, uint pixel, uint sign) {
 void main() {
     uint x = gl_GlobalInvocationID.x, frame = gl_WorkGroupID.z;
     if (x >= width) return;
-    int top = int(gl_WorkGroupID.y) * STRIP, rows = int(height);
-    [[unroll]] for (uint level = 0u; level < MOST_LEVELS; level++) excess[level] = 0u;
+    int top = int(gl_WorkGroupID.y) * ROWS, rows = int(height);
+    [[unroll]] for (uint level = 0u; level < SUMMED_LEVELS; level++) excess[level] = 0u;
     all_levels = 0u;
-    for (int k = 0; k < BOX; k++) add(frame, uint(reflected(top + k - BEFORE, rows)) * width + x, 1u);
-    for (int y = top; y < min(top + STRIP, rows); y++) {
+    for (int k = 0; k < SIDE; k++) add(frame, uint(reflected(top + k - BEFORE, rows)) * width + x, 1u);
+    for (int y = top; y < min(top + ROWS, rows); y++) {
         uint pixel = uint(y) * width + x, first = frame * (levels + 1u);
-        [[unroll]] for (uint level = 0u; level < MOST_LEVELS; level++)
+        [[unroll]] for (uint level = 0u; level < SUMMED_LEVELS; level++)
             if (level < levels) columns[(first + level) * (width * height) + pixel] = excess[level];
         columns[(first + levels) * (width * height) + pixel] = all_levels;
-        add(frame, uint(reflected(y + BOX - BEFORE, rows)) * width + x, 1u);
+        add(frame, uint(reflected(y + SIDE - BEFORE, rows)) * width + x, 1u);
         add(frame, uint(reflected(y - BEFORE, rows)) * width + x, 0xffffffffu);
     }
 }

@@ -28,11 +28,11 @@ uint column(uint plane, uint row, int x) {
 // Box sums of the pixels first .. first + RUN of a row.
 void box_sums(uint plane, uint row, int first, out uint sums[RUN]) {
     uint sum = 0u;
-    for (int k = 0; k < BOX; k++) sum += column(plane, row, first + k - BEFORE);
+    for (int k = 0; k < SIDE; k++) sum += column(plane, row, first + k - BEFORE);
     [[unroll]] for (uint j = 0u; j < RUN; j++) {
         sums[j] = sum;
         int x = first + int(j);
-        sum += column(plane, row, x + BOX - BEFORE) - column(plane, row, x - BEFORE);
+        sum += column(plane, row, x + SIDE - BEFORE) - column(plane, row, x - BEFORE);
     }
 }
 
@@ -57,7 +57,7 @@ void main() {
                 uint x = first + j, pixel = row * width + x;
                 if (x < width) {
                     uint entry = entry_of(frame * levels + level, pixel);
-                    peak = max(peak, uint(BOX * BOX) * excess_of(entry) + sums[j]);
+                    peak = max(peak, uint(SIDE * SIDE) * excess_of(entry) + sums[j]);
                     if ((entry & ANSWERS) != 0u && precedes(evidence[j], pixel, sum, place)) {
                         sum = evidence[j];
                         place = pixel;

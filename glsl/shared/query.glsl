@@ -3,14 +3,14 @@
 #ifndef QUERY
 #define QUERY
 // Side of the box, and its columns or rows before its pixel.
-const int BOX = 30;
+const int SIDE = 30;
 const int BEFORE = 15;
 // Relevancy 1.
 const uint UNIT = 1048576u;
 // Bit of a table's entry whose code answers.
 const uint ANSWERS = 2147483648u;
 // Levels whose sum over a box fits in 32 bits.
-const uint MOST_LEVELS = 4u;
+const uint SUMMED_LEVELS = 4u;
 
 // Index in 0 .. n of a reflection that does not repeat the border.
 int reflected(int i, int n) {

@@ -1,9 +1,9 @@
 //! Search of frames for a text query on a device that keeps their code maps
 //! (docs/internals/method.md#level-and-mask).
 use crate::Result;
-use crate::gpu::shaders::query_columns::STRIP;
+use crate::gpu::shaders::query_columns::ROWS;
 use crate::gpu::shaders::query_peaks::{NONE, RUN, WORKGROUP};
-use crate::gpu::shaders::shared::query::{ANSWERS, MOST_LEVELS};
+use crate::gpu::shaders::shared::query::{ANSWERS, SUMMED_LEVELS};
 use crate::gpu::{Buffer, Device, KernelVariant, Program, Recorder, shaders};
 use crate::query::frame::{FrameSearch, LevelPeaks, Table};
 use crate::query::maps::CodeMaps;
@@ -59,7 +59,7 @@ impl DeviceSearch {
             let (width, height, levels) = shape(&same[0]);
             let bytes = 4 * (levels as u64 + 1) * (width * height) as u64;
             let at_once = most.checked_div(bytes).unwrap_or(0).min(u16::MAX.into()) as usize;
-            if at_once == 0 || levels > MOST_LEVELS as usize {
+            if at_once == 0 || levels > SUMMED_LEVELS as usize {
                 return Ok(None);
             }
             for frames in same.chunks(at_once) {
@@ -107,7 +107,7 @@ impl Part {
             &shaders::query_columns::Push { width: w, height: h, levels: l, slots: s },
         );
         let columns_of = shaders::query_columns::WORKGROUP[0];
-        rec.dispatch(call, [w.div_ceil(columns_of), h.div_ceil(STRIP as u32), count as u32]);
+        rec.dispatch(call, [w.div_ceil(columns_of), h.div_ceil(ROWS as u32), count as u32]);
         rec.pass("query peaks");
         let call = shaders::query_peaks::call(
             &shaders::query_peaks::Bindings {
@@ -176,11 +176,11 @@ impl FrameSearch for DeviceSearch {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::shaders::shared::query::{SIDE, UNIT};
     use crate::gpu::{Options, TestDevice, options, test_device};
     use crate::math::Random;
     use crate::query::frame::HostSearch;
-    use crate::query::window::MOST_LEVELS as MOST;
-    use crate::query::{QueryOptions, answer_all};
+    use crate::query::{QueryOptions, answer_all, window};
     use crate::scene::Image;
 
     /// Maps of rectangles of codes, some pixels without one.
@@ -242,7 +242,13 @@ mod tests {
         let device = test_device();
         check(&device, &[[97, 71], [97, 71], [33, 130], [8, 5], [1, 1]], &[12, 8, 4]);
         check(&device, &[[41, 36]], &[2, 300]);
-        assert_eq!(MOST, MOST_LEVELS as usize);
+    }
+
+    /// The processor's side is in a crate without shaders, and has the numbers again.
+    #[test]
+    fn numbers_are_those_of_the_processor() {
+        assert_eq!((window::MOST_LEVELS, window::UNIT), (SUMMED_LEVELS as usize, UNIT));
+        assert_eq!(window::AREA as i32, SIDE * SIDE);
     }
 
     #[test]
