@@ -22,8 +22,8 @@ fn query(scene: &Path, text: &str, out: &Path) -> Result<()> {
         }
         let (x, y) = answer.location;
         let path = out.join(format!("{name}.png"));
-        picture::write_mask_png(&path, &answer.mask)?;
-        let pixels = answer.mask.data.iter().filter(|inside| **inside).count();
+        picture::write_mask_png(&path, &answer.mask())?;
+        let pixels = answer.mask_pixels();
         println!(
             "{name}: at ({x}, {y}), score {:.2}, level {}, {pixels} pixels in {}",
             answer.score,

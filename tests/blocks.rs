@@ -193,7 +193,7 @@ fn language_in_bands_matches_whole() {
     let seen = |device: &Device, field: &LanguageField, camera: &Camera| {
         let view = Viewer::new(device, &splats, field).unwrap().view_with_features(camera).unwrap();
         let answer = answer(&view.codes, field, &query, &QueryOptions::default()).unwrap();
-        (view.rendered, view.codes, answer.relevancy)
+        (view.rendered, view.codes, answer.relevancy())
     };
     for mib in [16, 64] {
         let device = limited(mib * MIB, true);

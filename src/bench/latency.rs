@@ -1,5 +1,5 @@
 //! Latency of text queries on a loaded scene.
-use super::measure::Budget;
+use super::measure::{Budget, Quartiles};
 use super::report::{Clock, Section};
 use crate::gpu::Device;
 use crate::infer::RegionEncoder;
@@ -26,7 +26,21 @@ pub fn measure(
     let rendering = budget.wall(|| scene.set_views(cameras).map(drop))?;
     section.time("render and decode all views", Clock::Wall, rendering);
     section.time("encode the text", Clock::Wall, encoding);
-    let query = budget.wall(|| scene.ask(text, &QueryOptions::default()).map(drop))?;
+    let query = budget.wall(|| {
+        scene.forget_texts();
+        scene.ask(text, &QueryOptions::default()).map(drop)
+    })?;
     section.time("query", Clock::Wall, query);
+    let again = budget.wall(|| scene.ask(text, &QueryOptions::default()).map(drop))?;
+    section.time("query of a text asked before", Clock::Wall, again);
+    let names: Vec<String> = scene.time_passes()?.into_keys().collect();
+    if names.is_empty() {
+        return Ok(section);
+    }
+    let passes = budget.repeat(|| scene.time_passes())?;
+    for name in &names {
+        let times: Vec<f64> = passes.iter().filter_map(|run| run.get(name)).copied().collect();
+        section.time(name, Clock::Device, Quartiles::of(&times));
+    }
     Ok(section)
 }

@@ -123,7 +123,7 @@ fn pack_all(
         packed.push(match &request.content {
             RenderContent::Frame(..) => None,
             RenderContent::Relevancy(text) => {
-                let map = one_view(live.ask(text, camera)?)?.relevancy.data;
+                let map = one_view(live.ask(text, camera)?)?.relevancy().data;
                 Some(match request.encoding {
                     Encoding::F32x4 => {
                         let texels: Vec<[f32; 4]> = map.iter().map(|v| [*v, 0.0, 0.0, 0.0]).collect();

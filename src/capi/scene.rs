@@ -228,7 +228,7 @@ pub unsafe extern "C" fn svk_scene_query(
                 score: f64::from(found.score),
                 x: found.location.0 as f64 + 0.5,
                 y: found.location.1 as f64 + 0.5,
-                mask_pixels: found.mask.data.iter().filter(|m| **m).count() as u64,
+                mask_pixels: found.mask_pixels() as u64,
                 presence: presence as u32,
                 instances,
                 p_value,
@@ -237,7 +237,7 @@ pub unsafe extern "C" fn svk_scene_query(
             boundary::write(answer, &value)?;
             if !mask.is_null() {
                 let out = std::slice::from_raw_parts_mut(mask, pixels);
-                out.iter_mut().zip(&found.mask.data).for_each(|(o, m)| *o = if *m { 255 } else { 0 });
+                out.iter_mut().zip(&found.mask().data).for_each(|(o, m)| *o = if *m { 255 } else { 0 });
             }
             Ok(())
         })

@@ -11,8 +11,13 @@ use crate::pass::decode::{Codes, decode_pixels};
 use crate::pass::pack::{self, Encoding, FrameChannel};
 use crate::pass::plane_sweep::{GpuMatcher, Matcher, ReferenceView, SourceView};
 use crate::pass::plane_sweep_cpu::CpuMatcher;
+use crate::pass::query_peaks::DeviceSearch;
 use crate::pass::ssim_l1::{self, SsimL1, SsimRowKernel};
+use crate::query::frame::{FrameSearch, HostSearch, LevelPeaks, Table};
+use crate::query::maps::CodeMaps;
+use crate::scene::Image;
 use glam::Vec4;
+use std::sync::Arc;
 
 const SIZE: (usize, usize) = (75, 53);
 const PIXELS: usize = SIZE.0 * SIZE.1;
@@ -116,6 +121,30 @@ pub(super) fn decode(device: &Device) -> Found {
         result = result.and(equal("codes", &actual, &reference));
     }
     Ok(result)
+}
+
+pub(super) fn query(device: &Device) -> Found {
+    let (width, height) = SIZE;
+    let mut random = Random::new(27);
+    // Blocks of 3 × 3 pixels of a code, one of thirteen none.
+    let mut map = |_| {
+        let blocks: Vec<i32> = (0..PIXELS).map(|_| random.below(13) as i32 - 1).collect();
+        let data = (0..PIXELS).map(|p| blocks[p / width / 3 * width + p % width / 3]).collect();
+        Image { width, height, data }
+    };
+    let frames: Vec<Arc<CodeMaps>> = (0..2)
+        .map(|_| Ok(Arc::new(CodeMaps::new(&[0, 1, 2].map(&mut map))?)))
+        .collect::<crate::Result<_>>()?;
+    let tables = [28, 29, 30].map(|seed| Table::new(&noise(12, seed)));
+    let answering = vec![vec![vec![0, 7, 11], vec![3], Vec::new()]; 2];
+    let expected = HostSearch(&frames).search(&tables, &answering)?;
+    let Some(mut search) = DeviceSearch::new(device, &frames, 12)? else {
+        return Ok(Err("the device does not bind the sums of a small frame".to_owned()));
+    };
+    let words = |found: Vec<Vec<LevelPeaks>>| -> Vec<u32> {
+        found.iter().flatten().flat_map(|f| [f.peak, f.location as u32]).collect()
+    };
+    Ok(equal("peaks", &words(search.search(&tables, &answering)?), &words(expected)))
 }
 
 pub(super) fn pack(device: &Device) -> Found {

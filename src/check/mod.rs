@@ -71,6 +71,7 @@ const CASES: &[Case] = &[
     case("SSIM and L1 loss", Some(KernelVariant::SsimShared), |d| images::ssim_l1(d, SsimRowKernel::Shared)),
     case("code loss", None, images::codes),
     case("decoding of codes", None, images::decode),
+    case("search of a text query", Some(KernelVariant::DeviceQuery), images::query),
     case("packing of images", None, images::pack),
     case("plane sweep stereo", Some(KernelVariant::DeviceSweep), images::plane_sweep),
 ];

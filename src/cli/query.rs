@@ -166,11 +166,12 @@ fn write(
     for (key, kind) in [("heat", "heat.png"), ("mask", "mask.png"), ("relevancy", "relevancy.npy")] {
         view[key] = name(kind).into();
     }
-    let heat = colour::heat_image(picture, &a.relevancy, Some(&a.mask));
+    let (relevancy, mask) = (a.relevancy(), a.mask());
+    let heat = colour::heat_image(picture, &relevancy, Some(&mask));
     picture::write_png(&out.file(&name("heat.png"))?, &heat)?;
-    picture::write_mask_png(&out.file(&name("mask.png"))?, &a.mask)?;
-    let size = (a.relevancy.width, a.relevancy.height);
-    picture::write_npy(&out.file(&name("relevancy.npy"))?, size, None, &a.relevancy.data)
+    picture::write_mask_png(&out.file(&name("mask.png"))?, &mask)?;
+    let size = (relevancy.width, relevancy.height);
+    picture::write_npy(&out.file(&name("relevancy.npy"))?, size, None, &relevancy.data)
 }
 
 /// Position of the answer in space and its distance from the camera; null if the scene shows
@@ -193,7 +194,7 @@ fn to_json(stem: &str, a: &QueryResult, place: &Value) -> Value {
         "view": stem, "found": a.found, "score": a.score, "level": LEVEL_NAMES[a.level],
         // Pixel position of the most relevant pixel's centre; the first pixel's is (0.5, 0.5).
         "location": [a.location.0 as f64 + 0.5, a.location.1 as f64 + 0.5],
-        "mask_pixels": a.mask.data.iter().filter(|m| **m).count(),
+        "mask_pixels": a.mask_pixels(),
     })
 }
 
@@ -291,7 +292,7 @@ mod tests {
     fn place_json_states_units_and_metres() {
         let mut rendered = RenderedFrame::empty(4, 4, 0);
         rendered.depth.data.fill(4.0);
-        let frame = DecodedFrame { rendered, codes: Vec::new(), filled: None };
+        let frame = DecodedFrame::new(rendered, Vec::new(), None).unwrap();
         let (pose, size) = (Pose::IDENTITY, 4);
         let camera =
             Camera { name: "a".into(), width: size, height: size, fx: 4.0, fy: 4.0, cx: 0.5, cy: 1.5, pose };

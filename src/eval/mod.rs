@@ -333,7 +333,7 @@ impl Evaluation {
                 split: frame.split,
                 label: *label,
                 phrase: phrase.clone(),
-                iou: iou(&answer.mask, &objects, *label)?,
+                iou: iou(&answer.mask(), &objects, *label)?,
                 localised: x < objects.width && y < objects.height && objects.at(x, y) == *label,
                 level: answer.level,
                 score: answer.score,
@@ -455,7 +455,7 @@ fn write_files(out: &Path, stem: &str, shown: &RgbImage, answers: &[(u32, QueryR
     for (label, answer) in answers {
         let path = out.join("masks").join(label.to_string()).join(format!("{stem}.png"));
         make_parent(&path)?;
-        picture::write_mask_png(&path, &answer.mask)?;
+        picture::write_mask_png(&path, &answer.mask())?;
     }
     Ok(())
 }

@@ -1,4 +1,5 @@
 use super::*;
+use crate::query::AnswerImages;
 use glam::{DMat3, DVec3};
 
 fn breakfast() -> GroundTruth {
@@ -44,10 +45,9 @@ fn evaluation_scores_perfect_scene_perfectly() {
                 let mask: Vec<bool> = objects.data.iter().map(|&o| o == label).collect();
                 let p = mask.iter().position(|&m| m).unwrap_or(0);
                 let mask = Image { width: 640, height: 480, data: mask };
-                (
-                    label,
-                    QueryResult { mask, location: (p % 640, p / 640), found: true, ..QueryResult::default() },
-                )
+                let images = AnswerImages::of_mask(mask);
+                let location = (p % 640, p / 640);
+                (label, QueryResult { images, location, found: true, ..QueryResult::default() })
             })
             .collect();
         eval.add_frame(&frame, &Rendered { rgb, filled: None, alpha, depth }, &answers).unwrap();

@@ -42,6 +42,10 @@ pub enum KernelVariant {
     HostSweep,
     /// Plane sweep of stereo by shaders ([`crate::pass::plane_sweep`]).
     DeviceSweep,
+    /// Search of frames for text queries by the processor ([`crate::query::frame::HostSearch`]).
+    HostQuery,
+    /// Search of frames for text queries by shaders ([`crate::pass::query_peaks`]).
+    DeviceQuery,
     /// Native code in place of shaders where the device is the processor ([`crate::native`]).
     NativePasses,
     /// Shaders everywhere.
@@ -50,7 +54,7 @@ pub enum KernelVariant {
 
 impl KernelVariant {
     /// All of them.
-    pub const ALL: [KernelVariant; 19] = [
+    pub const ALL: [KernelVariant; 21] = [
         KernelVariant::FloatAtomics,
         KernelVariant::AtomicGradients,
         KernelVariant::StoredGradients,
@@ -68,6 +72,8 @@ impl KernelVariant {
         KernelVariant::FusedUpdate,
         KernelVariant::HostSweep,
         KernelVariant::DeviceSweep,
+        KernelVariant::HostQuery,
+        KernelVariant::DeviceQuery,
         KernelVariant::NativePasses,
         KernelVariant::ShaderPasses,
     ];
@@ -92,6 +98,8 @@ impl KernelVariant {
             KernelVariant::FusedUpdate => "update in one pass",
             KernelVariant::HostSweep => "plane sweep on the host",
             KernelVariant::DeviceSweep => "plane sweep on the device",
+            KernelVariant::HostQuery => "text queries on the host",
+            KernelVariant::DeviceQuery => "text queries on the device",
             KernelVariant::NativePasses => "native passes",
             KernelVariant::ShaderPasses => "shader passes",
         }
@@ -117,6 +125,8 @@ impl KernelVariant {
             KernelVariant::FusedUpdate => KernelVariant::SeparateUpdate,
             KernelVariant::HostSweep => KernelVariant::DeviceSweep,
             KernelVariant::DeviceSweep => KernelVariant::HostSweep,
+            KernelVariant::HostQuery => KernelVariant::DeviceQuery,
+            KernelVariant::DeviceQuery => KernelVariant::HostQuery,
             KernelVariant::NativePasses => KernelVariant::ShaderPasses,
             KernelVariant::ShaderPasses => KernelVariant::NativePasses,
         }

@@ -19,6 +19,7 @@ pub mod plane_sweep;
 pub mod plane_sweep_cpu;
 pub mod project;
 pub mod project_backward;
+pub mod query_peaks;
 pub mod raster_backward;
 pub mod raster_forward;
 pub mod rasterizer;

@@ -107,14 +107,14 @@ pub struct ViewShown<'a> {
 }
 
 /// Answer to one query in one view.
-#[derive(Clone, Copy, Debug)]
-pub struct AnswerShown<'a> {
+#[derive(Clone, Debug)]
+pub struct AnswerShown {
     /// Index into the views.
     pub view: usize,
     /// [H, W] relevancy, size of the photo.
-    pub relevancy: &'a Image<f32>,
+    pub relevancy: Image<f32>,
     /// [H, W] mask.
-    pub mask: Option<&'a Image<bool>>,
+    pub mask: Option<Image<bool>>,
     /// Whether the view shows it.
     pub found: bool,
 }
@@ -140,7 +140,7 @@ pub struct QueryShown<'a> {
     /// How sure it is.
     pub certainty: Certainty,
     /// One per view.
-    pub answers: Vec<AnswerShown<'a>>,
+    pub answers: Vec<AnswerShown>,
 }
 
 /// Figure of a run.

@@ -141,7 +141,9 @@ fn query_row(report: &HtmlReport, q: &QueryShown) -> Result<String> {
         let (picture, what) = match (q.certainty, a.found) {
             (Certainty::Nothing, _) => (Picture::Heat(view.photo, a), "nearest is warm"),
             (_, false) => (Picture::Outline(view.photo, None), "not seen"),
-            (Certainty::Unsure, true) => (Picture::Outline(view.photo, a.mask), "perhaps what is outlined"),
+            (Certainty::Unsure, true) => {
+                (Picture::Outline(view.photo, a.mask.as_ref()), "perhaps what is outlined")
+            }
             (Certainty::Found, true) => (Picture::Heat(view.photo, a), "outlined"),
         };
         figure(&picture.image(), &format!("{}: {what}", view.name))
@@ -200,7 +202,8 @@ mod tests {
             light: Light { gain: [1.2; 3], ..Light::NONE },
         };
         let mask = Image::filled(8, 6, true);
-        let answer = |found| AnswerShown { view: 0, relevancy: &relevancy, mask: Some(&mask), found };
+        let answer =
+            |found| AnswerShown { view: 0, relevancy: relevancy.clone(), mask: Some(mask.clone()), found };
         let query = |text, verdict: &str, certainty| QueryShown {
             text,
             verdict: verdict.into(),

@@ -33,7 +33,7 @@ enum Picture<'a> {
     Depth(&'a Image<f32>),
     Labels(&'a Image<i32>),
     /// Answer to a query, over its photo.
-    Heat(&'a RgbImage, &'a AnswerShown<'a>),
+    Heat(&'a RgbImage, &'a AnswerShown),
     /// An unsure answer: its outline only, since heat reads as a find.
     Outline(&'a RgbImage, Option<&'a Image<bool>>),
 }
@@ -45,7 +45,7 @@ impl Picture<'_> {
             Picture::Depth(depth) => Cow::Owned(colour::depth_image(depth)),
             Picture::Labels(codes) => Cow::Owned(colour::label_image(codes)),
             Picture::Heat(photo, answer) => {
-                Cow::Owned(colour::heat_image(photo, answer.relevancy, answer.mask))
+                Cow::Owned(colour::heat_image(photo, &answer.relevancy, answer.mask.as_ref()))
             }
             Picture::Outline(photo, mask) => Cow::Owned(colour::outline_image(photo, *mask)),
         }

@@ -2,15 +2,20 @@
 //! every view.
 use super::view::DecodedFrame;
 use crate::Result;
+use crate::query::frame::FrameSearch;
 use crate::query::highlight::{Highlight, highlight};
-use crate::query::instances::{Instance, Places};
+use crate::query::instances::{Instance, Places, Visible};
+use crate::query::maps::CodeMaps;
 use crate::query::phrasing::{Phrasing, Reading};
 use crate::query::presence::{Background, Evidence, Presence, ShownCodes, ShownPixels};
 use crate::query::select::{Selection, select};
-use crate::query::{self, QueryOptions, QueryResult, TextQuery};
+use crate::query::{self, CanonicalCosines, QueryOptions, QueryResult, TextQuery};
 use crate::report::viewer::ShownAnswer;
-use crate::scene::{Camera, Image, LanguageField, Splats, World};
+use crate::scene::{Camera, LanguageField, Splats, World};
+use rayon::prelude::*;
 use serde_json::{Value, json};
+use std::borrow::Cow;
+use std::sync::{Arc, OnceLock};
 
 /// Query data of a scene, prepared once.
 pub struct Prepared {
@@ -18,6 +23,8 @@ pub struct Prepared {
     places: Places,
     /// Codes that the photos' cameras show.
     pub(super) shown: ShownPixels,
+    /// Cosines of the codes to the canonical phrases of the first query.
+    cosines: OnceLock<CanonicalCosines>,
 }
 
 /// The answers to one text: of the scene, and one per view.
@@ -138,13 +145,21 @@ pub fn verdict(presence: Option<Presence>, reading: &Reading, found: usize, view
 impl Prepared {
     /// Prepares a scene with the codes that its own cameras show.
     pub fn new(splats: &Splats, field: &LanguageField, shown: ShownPixels) -> Prepared {
-        Prepared { places: Places::of(splats, field), shown }
+        Prepared { places: Places::of(splats, field), shown, cosines: OnceLock::new() }
     }
 
     /// Prepares a scene with the frames of its own cameras.
     pub fn of_frames(splats: &Splats, field: &LanguageField, frames: &[DecodedFrame]) -> Prepared {
-        let codes: Vec<&[Image<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
-        Prepared::new(splats, field, ShownPixels::of(field, &codes))
+        Prepared::new(splats, field, ShownPixels::of(field, frames.iter().map(|f| f.maps.as_ref())))
+    }
+
+    /// Cosines of the codes to canonical phrases; those of a scene's queries are all the same.
+    fn cosines(&self, field: &LanguageField, canonicals: &[f32]) -> Cow<'_, CanonicalCosines> {
+        let known = self.cosines.get_or_init(|| CanonicalCosines::new(field, canonicals));
+        match known.is_of(canonicals) {
+            true => Cow::Borrowed(known),
+            false => Cow::Owned(CanonicalCosines::new(field, canonicals)),
+        }
     }
 
     /// Evidence for the presence of a text; `background` caches the fit of the other things of its
@@ -153,40 +168,66 @@ impl Prepared {
         &self,
         field: &LanguageField,
         query: &TextQuery,
+        cosines: &CanonicalCosines,
         background: &mut Option<Background>,
     ) -> Option<Evidence> {
-        let shown = ShownCodes::new(&self.shown, field, &query.canonicals);
+        let shown = ShownCodes::new(&self.shown, field, cosines);
         let background = background.get_or_insert_with(|| shown.background(&query.alternatives.things));
         let evidence = shown.evidence(&query.embedding, &query.alternatives.colours, background);
         evidence.map(|e| if query.reading.is_doubtful() { e.in_doubt() } else { e })
     }
 
     /// Splats of the answer to a text; none if it does not fit the scene.
-    fn select(
-        &self,
-        field: &LanguageField,
-        query: &TextQuery,
-        fits: bool,
-        options: &QueryOptions,
-    ) -> Result<Selection> {
-        let mut selection = select(field, &self.places, query, options)?;
+    fn select(&self, relevancy: &[Vec<f32>], fits: bool, options: &QueryOptions) -> Selection {
+        let mut selection = select(&self.places, relevancy, options);
         if !fits {
             selection.splats.clear();
             selection.found = false;
         }
-        Ok(selection)
+        selection
     }
 
-    /// Answers a text in views, which need not be the scene's own.
+    /// Things of a selection with their pixels in views, and the reliability of the parts that the
+    /// views show.
+    fn things(
+        &self,
+        selection: &Selection,
+        (cameras, frames): (&[Camera], &[DecodedFrame]),
+    ) -> (Vec<Instance>, Vec<Option<f64>>) {
+        let pairs = cameras.par_iter().zip(frames);
+        let (visible, mut instances) = rayon::join(
+            || -> Vec<Visible> {
+                let view = |(c, f): (&Camera, &DecodedFrame)| {
+                    self.places.visible(&selection.splats, c, &f.rendered.depth)
+                };
+                pairs.map(view).collect()
+            },
+            || match selection.found {
+                true => self.places.instances(&selection.splats, selection.level),
+                false => Vec::new(),
+            },
+        );
+        instances.par_iter_mut().for_each(|instance| {
+            instance.pixels = visible.iter().map(|v| self.places.pixel(instance, v)).collect();
+        });
+        let reliability = |v: &Visible| self.places.reliability(&v.splats(), selection.level);
+        (instances, visible.par_iter().map(reliability).collect())
+    }
+
+    /// Answers a text in views, which need not be the scene's own. `search` has the maps of these
+    /// views on a device.
     pub fn answer(
         &self,
         field: &LanguageField,
-        (cameras, frames): (&[Camera], &[DecodedFrame]),
+        views: (&[Camera], &[DecodedFrame]),
         query: &TextQuery,
         options: &QueryOptions,
         background: &mut Option<Background>,
+        search: Option<&mut dyn FrameSearch>,
     ) -> Result<Answers> {
-        let evidence = self.evidence(field, query, background);
+        let cosines = self.cosines(field, &query.canonicals);
+        let relevancy = cosines.relevancy(field, query)?;
+        let evidence = self.evidence(field, query, &cosines, background);
         // Without evidence an unclear text is unsure.
         let doubt = query.reading.is_doubtful().then_some(Presence::Unsure);
         let fits = evidence.is_none_or(|e| e.presence != Presence::Absent);
@@ -194,31 +235,18 @@ impl Prepared {
             true => doubt,
             false => evidence.map(|e| e.presence).or(doubt),
         };
-        let codes: Vec<&[Image<i32>]> = frames.iter().map(|f| f.codes.as_slice()).collect();
-        let mut views = query::answer_all(&codes, field, query, options)?;
-        for view in views.iter_mut().filter(|v| !fits || !v.found) {
+        let selection = self.select(&relevancy, fits, options);
+        let maps: Vec<Arc<CodeMaps>> = views.1.iter().map(|f| f.maps.clone()).collect();
+        let mut answered = query::answer_all(&maps, &relevancy, options, search)?;
+        let (instances, view_reliability) = self.things(&selection, views);
+        for view in answered.iter_mut().filter(|v| !fits || !v.found) {
             view.mark_not_found();
         }
-        let selection = self.select(field, query, fits, options)?;
-        let mut instances = match selection.found {
-            true => self.places.instances(&selection.splats, selection.level),
-            false => Vec::new(),
-        };
-        for instance in &mut instances {
-            let views = cameras.iter().zip(frames);
-            let pixels = views.map(|(c, f)| self.places.pixel(instance, c, &f.rendered.depth));
-            instance.pixels = pixels.collect();
-        }
-        let reliability_in = |(camera, frame): (&Camera, &DecodedFrame)| {
-            let visible = self.places.seen_of(&selection.splats, camera, &frame.rendered.depth);
-            self.places.reliability(&visible, selection.level)
-        };
-        let view_reliability = cameras.iter().zip(frames).map(reliability_in).collect();
-        let highlight = highlight(&codes, field, query, &views)?;
+        let highlight = highlight(&maps, relevancy, &answered);
         Ok(Answers {
             text: query.text.clone(),
             reading: query.reading.clone(),
-            views,
+            views: answered,
             presence,
             p_value: evidence.map(|e| e.p_value),
             reliability: self.places.reliability(&selection.splats, selection.level),
@@ -238,7 +266,7 @@ mod tests {
     use crate::query::CANONICAL_PHRASES;
     use crate::query::phrasing::Vocabulary;
     use crate::query::presence::Alternatives;
-    use crate::scene::{Codebook, LevelField, Pose, Scale};
+    use crate::scene::{Codebook, Image, LevelField, Pose, Scale};
     use glam::DVec3;
     use splatvk_test_support::embedding::{self, text_embedding};
     use std::sync::Arc;
@@ -302,7 +330,7 @@ mod tests {
         let none = Image::filled(SIZE, SIZE, -1);
         let mut rendered = RenderedFrame::empty(SIZE, SIZE, 0);
         rendered.depth.data.fill(1.0);
-        let frames = vec![DecodedFrame { rendered, codes: vec![none.clone(), none, codes], filled: None }];
+        let frames = vec![DecodedFrame::new(rendered, vec![none.clone(), none, codes], None).unwrap()];
         let (size, focal) = (SIZE as u32, SIZE as f64);
         let cameras = vec![Camera {
             name: "a".into(),
@@ -334,7 +362,9 @@ mod tests {
             let alternatives = Alternatives { things: self.things.clone(), colours: Vec::new() };
             let query = TextQuery { alternatives, reading, ..rule_query(text) };
             let views = (&self.cameras[..], &self.frames[..]);
-            self.prepared.answer(&self.field, views, &query, &QueryOptions::default(), &mut None).unwrap()
+            self.prepared
+                .answer(&self.field, views, &query, &QueryOptions::default(), &mut None, None)
+                .unwrap()
         }
     }
 
@@ -348,8 +378,8 @@ mod tests {
             assert_eq!(a.presence, Some(Presence::Absent));
             assert!(a.views[0].score > 0.5, "{}", a.views[0].score);
             let view = &a.views[0];
-            assert!(!view.found && !view.mask.data.contains(&true) && a.found() == 0);
-            assert!(view.relevancy.data.iter().any(|v| *v > 0.0), "the heat stays");
+            assert!(!view.found && !view.mask().data.contains(&true) && a.found() == 0);
+            assert!(view.relevancy().data.iter().any(|v| *v > 0.0), "the heat stays");
             assert!(a.instances.is_empty() && a.selection.splats.is_empty() && !a.selection.found);
             assert_eq!(a.verdict(), "not in this scene");
             let record = a.record(&["a".into()], &World::default());

@@ -1,15 +1,20 @@
 //! Queries to a scene on the device: for viewers, `splatvk query`, the C interface and benchmarks.
 use super::answer::{Answers, Prepared};
-use super::recent::AlternativesCache;
+use super::recent::{AlternativesCache, RecentQueries};
 use super::view::{DecodedFrame, Viewer};
 use crate::gpu::Device;
 use crate::infer::{RegionEncoder, things};
+use crate::pass::query_peaks::DeviceSearch;
+use crate::query::frame::FrameSearch;
+use crate::query::maps::CodeMaps;
 use crate::query::phrasing::{self, Reading, Vocabulary};
 use crate::query::presence::{Alternatives, ShownPixels};
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, TextQuery};
 use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
+use std::collections::BTreeMap;
+use std::sync::Arc;
 
 /// Builds the query of a text. With `verbatim` all its words count, as in published protocols.
 fn as_query(
@@ -22,12 +27,11 @@ fn as_query(
     phrasing::check(text)?;
     let phrasing = if verbatim || encoder.has_table_entry(text) { None } else { phrasing::read(text) };
     let understood = phrasing.as_ref().map_or(text, |p| &p.answers_for).to_owned();
-    let embedding = encoder.embed_texts(&[&understood])?;
+    let (embedding, nearest) = encoder.embed_with_nearest_word(&understood)?;
     let form = things::form(&understood);
     let things = alternatives_cache.entry(&form, |form| encoder.embed_other_things(form))?.things.clone();
     let alternatives = Alternatives { things, colours: encoder.embed_recoloured(&understood)? };
-    let vocabulary =
-        encoder.find_nearest_word(&understood)?.map(|(known, nearest)| Vocabulary { known, nearest });
+    let vocabulary = nearest.map(|(known, nearest)| Vocabulary { known, nearest });
     let reading = Reading { phrasing, vocabulary };
     Ok(TextQuery { text: text.to_owned(), embedding, canonicals: canonicals.to_vec(), alternatives, reading })
 }
@@ -54,6 +58,8 @@ pub(super) struct QuerySession {
     /// [C, D] unit rows of the canonical phrases.
     canonicals: Vec<f32>,
     alternatives_cache: AlternativesCache,
+    /// Queries of the last texts.
+    recent: RecentQueries,
     prepared: Prepared,
     /// Cameras of the scene whose views are not decoded yet.
     pending_views: Option<Vec<Camera>>,
@@ -77,6 +83,7 @@ impl QuerySession {
             encoder,
             canonicals,
             alternatives_cache: AlternativesCache::default(),
+            recent: RecentQueries::default(),
             prepared: Prepared::new(splats, field, ShownPixels::default()),
             pending_views: Some(cameras.to_vec()),
         })
@@ -93,10 +100,10 @@ impl QuerySession {
         let Some(own) = self.pending_views.take() else { return Ok(()) };
         let shown = &mut self.prepared.shown;
         match own.is_empty() || own == cameras {
-            true => frames.iter().for_each(|f| shown.add(field, &f.codes)),
+            true => frames.iter().for_each(|f| shown.add(field, &f.maps)),
             false => {
                 for camera in &own {
-                    shown.add(field, &viewer.codes(camera)?);
+                    shown.add(field, &CodeMaps::new(&viewer.codes(camera)?)?);
                 }
             }
         }
@@ -105,11 +112,13 @@ impl QuerySession {
 
     /// The understood part of a text.
     pub(super) fn reading(&mut self, text: &str) -> Result<Reading> {
-        Ok(self.query(text)?.reading)
+        Ok(self.query(text)?.reading.clone())
     }
 
-    fn query(&mut self, text: &str) -> Result<TextQuery> {
-        as_query(text, self.encoder.as_mut(), &self.canonicals, &mut self.alternatives_cache, false)
+    fn query(&mut self, text: &str) -> Result<Arc<TextQuery>> {
+        let (encoder, alternatives) = (self.encoder.as_mut(), &mut self.alternatives_cache);
+        let canonicals = &self.canonicals;
+        self.recent.entry(text, |text| as_query(text, encoder, canonicals, alternatives, false))
     }
 
     /// Answers a text in views.
@@ -120,18 +129,19 @@ impl QuerySession {
         field: &LanguageField,
         views: (&[Camera], &[DecodedFrame]),
         options: &QueryOptions,
+        search: Option<&mut dyn FrameSearch>,
     ) -> Result<Answers> {
         let query = self.query(text)?;
         self.decode_own_views(viewer, field, views)?;
         let understood = query.reading.phrasing.as_ref().map_or(text, |p| &p.answers_for);
         let form = things::form(understood);
         let shared = self.alternatives_cache.entry(&form, |form| self.encoder.embed_other_things(form))?;
-        self.prepared.answer(field, views, &query, options, &mut shared.background)
+        self.prepared.answer(field, views, &query, options, &mut shared.background, search)
     }
 }
 
 /// The scene on the device, its code maps in the set views, and the text encoder. A query embeds
-/// its text and runs a gather and five box filters per camera; it renders nothing.
+/// its text, unless it was asked before, and searches the code maps; it renders nothing.
 ///
 /// ```no_run
 /// # fn main() -> splatvk::Result<()> {
@@ -152,6 +162,9 @@ pub struct QueryScene {
     session: QuerySession,
     cameras: Vec<Camera>,
     frames: Vec<DecodedFrame>,
+    device: Device,
+    /// The code maps of the frames on a device that searches them.
+    search: Option<DeviceSearch>,
 }
 
 impl QueryScene {
@@ -165,16 +178,28 @@ impl QueryScene {
     ) -> Result<Self> {
         let session = QuerySession::open(encoder, splats, &field, cameras)?;
         let viewer = Viewer::new(device, splats, &field)?;
-        Ok(QueryScene { viewer, field, session, cameras: Vec::new(), frames: Vec::new() })
+        Ok(QueryScene {
+            viewer,
+            field,
+            session,
+            cameras: Vec::new(),
+            frames: Vec::new(),
+            device: device.clone(),
+            search: None,
+        })
     }
 
     /// Renders and decodes the cameras of later queries.
     pub fn set_views(&mut self, cameras: &[Camera]) -> Result<&[DecodedFrame]> {
+        self.search = None;
         self.frames.clear();
         for camera in cameras {
             self.frames.push(self.viewer.view(camera)?);
         }
         self.cameras = cameras.to_vec();
+        let maps: Vec<Arc<CodeMaps>> = self.frames.iter().map(|f| f.maps.clone()).collect();
+        let codes = self.field.levels.iter().map(|l| l.codebook.len()).max().unwrap_or(0);
+        self.search = DeviceSearch::open(&self.device, &maps, codes)?;
         Ok(&self.frames)
     }
 
@@ -193,14 +218,26 @@ impl QueryScene {
         &self.field
     }
 
+    /// Forgets the queries of the last texts: the next text is embedded again.
+    pub fn forget_texts(&mut self) {
+        self.session.recent = RecentQueries::default();
+    }
+
     /// The frames of the last [`QueryScene::set_views`].
     pub fn frames(&self) -> &[DecodedFrame] {
         &self.frames
     }
 
+    /// Device milliseconds of the passes that search the frames; none where the processor does.
+    pub fn time_passes(&self) -> Result<BTreeMap<String, f64>> {
+        self.search.as_ref().map_or_else(|| Ok(BTreeMap::new()), DeviceSearch::time_passes)
+    }
+
     /// Answers a text in every frame.
     pub fn ask(&mut self, text: &str, options: &QueryOptions) -> Result<Answers> {
-        self.session.ask(text, &mut self.viewer, &self.field, (&self.cameras, &self.frames), options)
+        let views = (&self.cameras[..], &self.frames[..]);
+        let search = self.search.as_mut().map(|search| search as &mut dyn FrameSearch);
+        self.session.ask(text, &mut self.viewer, &self.field, views, options, search)
     }
 }
 

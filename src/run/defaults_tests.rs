@@ -62,7 +62,8 @@ fn score(x: &Inputs) -> Vec<(String, Vec<(f32, bool)>)> {
         for (t, view) in x.views.iter().enumerate() {
             let maps: Vec<Image<i32>> = built.field.levels.iter().map(|l| l.targets[t].clone()).collect();
             let r = answer(&maps, &built.field, query, &QueryOptions::default()).unwrap();
-            let pairs = view.masks.data.iter().map(|o| o == k).zip(&r.mask.data);
+            let mask = r.mask();
+            let pairs = view.masks.data.iter().map(|o| o == k).zip(&mask.data);
             let (both, either) =
                 pairs.fold((0, 0), |(b, e), (o, &m)| (b + u32::from(o && m), e + u32::from(o || m)));
             row.push((both as f32 / either.max(1) as f32, view.masks.at(r.location.0, r.location.1) == *k));

@@ -131,10 +131,9 @@ mod tests {
     #[test]
     fn psnr_compares_photo_with_finished_scene() {
         let image = |v: f32| RgbImage { width: 64, height: 64, data: vec![[v; 3]; 4096] };
-        let frame = |v: f32| DecodedFrame {
-            rendered: RenderedFrame { rgb: image(v), ..RenderedFrame::default() },
-            codes: Vec::new(),
-            filled: None,
+        let frame = |v: f32| {
+            let rendered = RenderedFrame { rgb: image(v), ..RenderedFrame::default() };
+            DecodedFrame::new(rendered, Vec::new(), None).unwrap()
         };
         let photos =
             ["a.png", "b.png"].map(|n| crate::photo::from_pixels(n.as_ref(), &image(0.5), None, 64).unwrap());

@@ -271,7 +271,7 @@ impl LiveScene {
         };
         let field = field.ok_or_else(no_language)?;
         let views = (std::slice::from_ref(&camera), std::slice::from_ref(&frame));
-        let answers = session.ask(text, &mut self.viewer, field, views, &self.options);
+        let answers = session.ask(text, &mut self.viewer, field, views, &self.options, None);
         self.last_view = Some((camera, frame));
         answers
     }

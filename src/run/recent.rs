@@ -1,10 +1,39 @@
 //! Data that queries share, kept within a bound: users may ask any text.
+use crate::query::TextQuery;
 use crate::query::presence::Background;
 use std::sync::Arc;
 
 /// Bound of the kept embeddings, bytes: those of texts without a colour and of all with one take 20
 /// MB from `words`; some space remains.
 const MOST_BYTES: usize = 32 << 20;
+
+/// Most queries that are kept. One takes 30 kB, or 90 kB with the colours that it is not.
+const MOST_QUERIES: usize = 64;
+
+/// Cache by text; evicts the least recently asked text.
+#[derive(Default)]
+pub(super) struct RecentQueries {
+    /// Ordered by use, the latest last.
+    list: Vec<Arc<TextQuery>>,
+}
+
+impl RecentQueries {
+    /// Returns the query of a text; makes it if it is absent.
+    pub(super) fn entry<E>(
+        &mut self,
+        text: &str,
+        make: impl FnOnce(&str) -> Result<TextQuery, E>,
+    ) -> Result<Arc<TextQuery>, E> {
+        let query = match self.list.iter().position(|known| known.text == text) {
+            Some(index) => self.list.remove(index),
+            None => Arc::new(make(text)?),
+        };
+        let surplus = (self.list.len() + 1).saturating_sub(MOST_QUERIES);
+        self.list.drain(..surplus);
+        self.list.push(query.clone());
+        Ok(query)
+    }
+}
 
 /// Data that texts of one form share.
 pub(super) struct CachedAlternatives {
@@ -60,6 +89,30 @@ fn bytes(shared: &CachedAlternatives) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn queries_are_made_once_and_bounded() {
+        let (mut recent, mut made) = (RecentQueries::default(), 0);
+        let mut ask = |text: String| {
+            let query = recent.entry(&text, |text| {
+                made += 1;
+                Ok::<_, ()>(TextQuery { text: text.to_owned(), ..TextQuery::default() })
+            });
+            assert_eq!(query.unwrap().text, text);
+            (made, recent.list.len())
+        };
+        for text in ["cup", "mug", "cup", "mug "] {
+            ask(text.to_owned());
+        }
+        assert_eq!(ask("cup".into()), (3, 3));
+        for k in 0..MOST_QUERIES - 1 {
+            ask(k.to_string());
+        }
+        // "mug" and "mug " are evicted, "cup" was asked later.
+        assert_eq!(ask("cup".into()), (MOST_QUERIES + 2, MOST_QUERIES));
+        assert_eq!(ask("mug".into()), (MOST_QUERIES + 3, MOST_QUERIES));
+        assert!(recent.entry("pen", |_| Err(())).is_err());
+    }
 
     #[test]
     fn cache_evicts_least_recent_form() {

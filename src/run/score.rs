@@ -9,7 +9,7 @@ use crate::pass::metrics;
 use crate::progress::Progress;
 use crate::query::instances::Places;
 use crate::query::select::select;
-use crate::query::{QueryOptions, QueryResult, TextQuery, answer_with, field_relevancy};
+use crate::query::{QueryOptions, QueryResult, TextQuery, answer_all, field_relevancy};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 
 /// Queries of an evaluation.
@@ -45,11 +45,11 @@ pub fn score_field(
     let labels: Vec<u32> = evaluation.phrases().into_iter().map(|p| p.0).collect();
     let relevancy = queries.iter().map(|q| field_relevancy(field, q)).collect::<Result<Vec<_>>>()?;
     let places = Places::of(splats, field);
-    let instances = |query: &TextQuery| -> Result<_> {
-        let selection = select(field, &places, query, &options)?;
-        Ok(places.instances(&selection.splats, selection.level))
+    let instances = |relevancy: &Vec<Vec<f32>>| {
+        let selection = select(&places, relevancy, &options);
+        places.instances(&selection.splats, selection.level)
     };
-    evaluation.add_instances(&queries.iter().map(instances).collect::<Result<Vec<_>>>()?)?;
+    evaluation.add_instances(&relevancy.iter().map(instances).collect::<Vec<_>>())?;
     let mut viewer = Viewer::new(device, splats, field)?.with_backdrop(backdrop)?;
     let refiner = if refine { Some(ViewRefiner::new(device, splats)?) } else { None };
     let frames = evaluation.cameras();
@@ -58,11 +58,15 @@ pub fn score_field(
         progress.check()?;
         let view = viewer.view(camera)?;
         visit(frame, &view)?;
-        let answer_all = |view: &DecodedFrame| -> Result<Vec<(u32, QueryResult)>> {
-            let pairs = labels.iter().zip(&relevancy);
-            pairs.map(|(label, r)| Ok((*label, answer_with(&view.codes, r, &options)?))).collect()
+        let answer_labels = |view: &DecodedFrame| -> Result<Vec<(u32, QueryResult)>> {
+            let mut answers = Vec::new();
+            for (label, relevancy) in labels.iter().zip(&relevancy) {
+                let found = answer_all(std::slice::from_ref(&view.maps), relevancy, &options, None)?;
+                answers.extend(found.into_iter().map(|answer| (*label, answer)));
+            }
+            Ok(answers)
         };
-        evaluation.add_frame(frame, &rendered(&view), &answer_all(&view)?)?;
+        evaluation.add_frame(frame, &rendered(&view), &answer_labels(&view)?)?;
         if let Some(refiner) = refiner.as_ref().filter(|_| frame.split == Split::Test) {
             let photo = evaluation.photo(frame)?;
             let with_intrinsics = evaluation.with_scene_intrinsics(camera);
@@ -77,7 +81,7 @@ pub fn score_field(
                 centre_shift: [with_intrinsics.cx - camera.cx, with_intrinsics.cy - camera.cy],
             };
             let best = closer.as_ref().unwrap_or(&view);
-            evaluation.add_refined(frame, score, &rendered(best), &answer_all(best)?)?;
+            evaluation.add_refined(frame, score, &rendered(best), &answer_labels(best)?)?;
         }
         progress.step(i as u64 + 1, "");
     }

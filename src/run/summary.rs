@@ -290,7 +290,7 @@ fn shown(a: &Answers) -> QueryShown<'_> {
         .views
         .iter()
         .enumerate()
-        .map(|(view, v)| AnswerShown { view, relevancy: &v.relevancy, mask: Some(&v.mask), found: v.found })
+        .map(|(view, v)| AnswerShown { view, relevancy: v.relevancy(), mask: Some(v.mask()), found: v.found })
         .collect();
     let certainty = match a.presence {
         _ if a.found() == 0 => Certainty::Nothing,

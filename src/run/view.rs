@@ -8,8 +8,10 @@ use crate::pass::raster_forward::BASE_CHANNELS;
 use crate::pass::rasterizer::FrameBuffers;
 use crate::pass::renderer::{RenderedFrame, Renderer};
 use crate::progress::Progress;
+use crate::query::maps::CodeMaps;
 use crate::scene::{Camera, Image, LanguageField, RgbImage, SH_C0, Seen, Splats};
 use std::ops::Range;
+use std::sync::Arc;
 
 /// A rendered frame and the code of every pixel per level (−1 = none).
 #[derive(Clone, Debug)]
@@ -20,11 +22,19 @@ pub struct DecodedFrame {
     /// Per level, index as in [`crate::scene::LEVEL_NAMES`]; levels without codes are −1
     /// everywhere.
     pub codes: Vec<Image<i32>>,
+    /// The codes, prepared for queries.
+    pub maps: Arc<CodeMaps>,
     /// Colours with the backdrop behind them, from a viewer with one.
     pub filled: Option<RgbImage>,
 }
 
 impl DecodedFrame {
+    /// Prepares the codes of a rendered frame for queries.
+    pub fn new(rendered: RenderedFrame, codes: Vec<Image<i32>>, filled: Option<RgbImage>) -> Result<Self> {
+        let maps = Arc::new(CodeMaps::new(&codes)?);
+        Ok(DecodedFrame { rendered, codes, maps, filled })
+    }
+
     /// The picture for people: with the backdrop, where there is one.
     pub fn picture(&self) -> &RgbImage {
         self.filled.as_ref().unwrap_or(&self.rendered.rgb)
@@ -190,7 +200,7 @@ impl Viewer {
             Some(renderer) => Some(over(&rendered, &renderer.render(camera)?.rgb)),
             None => None,
         };
-        Ok(DecodedFrame { rendered, codes, filled })
+        DecodedFrame::new(rendered, codes, filled)
     }
 
     /// Renders the models that `shown` or the codes need, and reads the parts that `shown` has room

@@ -95,15 +95,15 @@ impl Answer {
     /// (H, W) bool, the pixels of the answer in a view; False everywhere where it is not found.
     #[pyo3(signature = (camera = None))]
     fn mask(&self, py: Python<'_>, camera: Option<&Bound<'_, PyAny>>) -> PyResult<Py<PyAny>> {
-        let view = self.view(py, camera)?;
-        arrays::owned(py, view.mask.data, &[view.mask.height, view.mask.width])
+        let mask = self.view(py, camera)?.mask();
+        arrays::owned(py, mask.data, &[mask.height, mask.width])
     }
     /// (H, W) float32, relevancy in a view; 0.5 is as near as "object", "things", "stuff" or
     /// "texture".
     #[pyo3(signature = (camera = None))]
     fn heat(&self, py: Python<'_>, camera: Option<&Bound<'_, PyAny>>) -> PyResult<Py<PyAny>> {
-        let view = self.view(py, camera)?;
-        arrays::owned(py, view.relevancy.data, &[view.relevancy.height, view.relevancy.width])
+        let relevancy = self.view(py, camera)?.relevancy();
+        arrays::owned(py, relevancy.data, &[relevancy.height, relevancy.width])
     }
     /// Camera of the answer's own view.
     #[getter]

@@ -70,11 +70,30 @@ pub fn nearest(regions: &[f32], rows: &[f32], dim: usize, best: usize) -> Vec<Ve
 }
 
 fn nearest_rows(region: &[f32], rows: &[f32], best: usize) -> Vec<(usize, f32)> {
-    let cosine = |row: &[f32]| row.iter().zip(region).map(|(x, y)| x * y).sum::<f32>();
-    let mut list: Vec<(usize, f32)> = rows.chunks_exact(region.len()).map(cosine).enumerate().collect();
+    let mut list: Vec<(usize, f32)> = cosines(region, rows).into_iter().enumerate().collect();
     list.sort_by(|a, b| b.1.total_cmp(&a.1));
     list.truncate(best);
     list
+}
+
+/// `row·v` of the rows [P, D]. Each is summed in the order of its elements; eight sums side by side
+/// need not wait for one another's additions.
+fn cosines(v: &[f32], rows: &[f32]) -> Vec<f32> {
+    const TOGETHER: usize = 8;
+    let d = v.len().max(1);
+    let mut all = Vec::with_capacity(rows.len() / d);
+    let mut blocks = rows.chunks_exact(TOGETHER * d);
+    for block in &mut blocks {
+        let rows: [&[f32]; TOGETHER] = std::array::from_fn(|k| &block[k * d..(k + 1) * d]);
+        let mut sums = [0f32; TOGETHER];
+        for (i, x) in v.iter().enumerate() {
+            sums.iter_mut().zip(rows).for_each(|(sum, row)| *sum += row[i] * x);
+        }
+        all.extend(sums);
+    }
+    let rest = blocks.remainder().chunks_exact(d);
+    all.extend(rest.map(|row| row.iter().zip(v).map(|(a, b)| a * b).sum::<f32>()));
+    all
 }
 
 /// Embeds image regions and texts in one space of unit vectors, so that a cosine measures how well
@@ -117,6 +136,11 @@ pub trait RegionEncoder: Send {
     /// encoder without a fixed vocabulary.
     fn find_nearest_word(&mut self, _text: &str) -> Result<Option<(bool, String)>> {
         Ok(None)
+    }
+    /// The embedding [D] of a text, and [`RegionEncoder::find_nearest_word`] of it, for encoders that
+    /// share work between the two.
+    fn embed_with_nearest_word(&mut self, text: &str) -> Result<(Vec<f32>, Option<(bool, String)>)> {
+        Ok((self.embed_texts(&[text])?, self.find_nearest_word(text)?))
     }
     /// Name of the table or network that embedded a text; `None` from an encoder with a single one.
     fn embedding_source(&self, _text: &str) -> Option<String> {

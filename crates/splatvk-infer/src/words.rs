@@ -22,7 +22,7 @@ use super::cache::OutputKey;
 use super::classify::{CLASSES, Classifier};
 use super::registry::{PackFileKind, Registry};
 use super::text::{self, TextEncoder, normalise};
-use super::{RegionEncoder, colour, nearest, things};
+use super::{RegionEncoder, colour, cosines, nearest, things};
 use crate::progress::{Progress, Silent};
 use crate::scene::{Image, RgbImage};
 use crate::{Error, Result, files};
@@ -164,9 +164,18 @@ impl RegionEncoder for RegionWords {
     fn find_nearest_word(&mut self, text: &str) -> Result<Option<(bool, String)>> {
         let vocabulary = self.vocabulary(&Silent)?;
         let meaning = vocabulary.encoder.embed(&colour::without(text))?;
-        let meaning = vocabulary.centred(meaning);
-        let nearest = nearest(&meaning, &vocabulary.names, text::DIM, 1).concat();
-        Ok(nearest.first().map(|(class, cosine)| (*cosine >= KNOWN, vocabulary.list[*class].clone())))
+        Ok(vocabulary.nearest_word(meaning))
+    }
+
+    /// A text without a colour is embedded once for both.
+    fn embed_with_nearest_word(&mut self, text: &str) -> Result<(Vec<f32>, Option<(bool, String)>)> {
+        let vocabulary = self.vocabulary(&Silent)?;
+        let meaning = vocabulary.encoder.embed(text)?;
+        let mut row = vec![0f32; DIM];
+        vocabulary.fill_phrase(&mut row, text, meaning.clone());
+        let plain = colour::without(text);
+        let meaning = if plain == text { meaning } else { vocabulary.encoder.embed(&plain)? };
+        Ok((row, vocabulary.nearest_word(meaning)))
     }
 
     /// Class names, behind the region's colour where that raises the cosine: "yellow lemon".
@@ -256,6 +265,12 @@ impl Vocabulary {
         list.into_iter().map(name).collect()
     }
 
+    /// Whether a sentence embedding is in the vocabulary, and its nearest word.
+    fn nearest_word(&self, meaning: Vec<f32>) -> Option<(bool, String)> {
+        let nearest = nearest(&self.centred(meaning), &self.names, text::DIM, 1).concat();
+        nearest.first().map(|(class, cosine)| (*cosine >= KNOWN, self.list[*class].clone()))
+    }
+
     /// Subtracts the mean of the class names from a sentence embedding and normalises it.
     fn centred(&self, mut meaning: Vec<f32>) -> Vec<f32> {
         meaning.iter_mut().zip(&self.mean).for_each(|(v, m)| *v -= m);
@@ -275,8 +290,7 @@ impl Vocabulary {
 
     /// The weight [1000] on each class of a centred unit embedding; they sum to less than 1.
     fn weights(&self, meaning: &[f32]) -> Vec<f32> {
-        let cosine = |name: &[f32]| name.iter().zip(meaning).map(|(a, b)| a * b).sum::<f32>();
-        let scores: Vec<f32> = self.names.chunks_exact(text::DIM).map(cosine).collect();
+        let scores = cosines(meaning, &self.names);
         let most = scores.iter().copied().fold(THRESHOLD, f32::max);
         let power = |score: f32| ((score - most) / SOFTNESS).exp();
         let total = scores.iter().map(|s| power(*s)).sum::<f32>() + power(THRESHOLD);

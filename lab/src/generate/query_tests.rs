@@ -1,8 +1,9 @@
 //! Queries on features that are the exact text embeddings: those of generated regions.
 use super::regions;
 use splatvk::infer::things;
+use splatvk::query::maps::CodeMaps;
 use splatvk::query::presence::*;
-use splatvk::query::{TextQuery, field_relevancy};
+use splatvk::query::{CanonicalCosines, TextQuery, field_relevancy};
 use splatvk::scene::{Codebook, Image, LanguageField, LevelField};
 use splatvk_test_support::embedding::{DIM, text_embedding};
 
@@ -30,10 +31,10 @@ fn field(phrases: &[&str], speck: &str) -> (LanguageField, Vec<Image<i32>>) {
 fn evidence_separates_present_from_absent() {
     let present = ["red book", "blue mug", "lemon", "wooden table", "green can"];
     let (field, maps) = field(&present, "trombone");
-    let pixels = ShownPixels::of(&field, &[&maps]);
+    let pixels = ShownPixels::of(&field, [&CodeMaps::new(&maps).unwrap()]);
     let evidence = |text: &str, form: &str| {
         let query = regions::query(text);
-        let shown = ShownCodes::new(&pixels, &field, &query.canonicals);
+        let shown = ShownCodes::new(&pixels, &field, &CanonicalCosines::new(&field, &query.canonicals));
         let rows: Vec<f32> = things::of_form(form).iter().flat_map(|o| text_embedding(o)).collect();
         shown.evidence(&query.embedding, &query.alternatives.colours, &shown.background(&rows)).unwrap()
     };
@@ -57,11 +58,11 @@ fn evidence_separates_present_from_absent() {
 fn evidence_needs_pixels_and_background() {
     let (field, maps) = field(&["lemon"], "speck");
     let query = regions::query("lemon");
-    let pixels = ShownPixels::of(&field, &[&maps]);
-    let shown = ShownCodes::new(&pixels, &field, &query.canonicals);
+    let pixels = ShownPixels::of(&field, [&CodeMaps::new(&maps).unwrap()]);
+    let shown = ShownCodes::new(&pixels, &field, &CanonicalCosines::new(&field, &query.canonicals));
     assert_eq!(shown.evidence(&query.embedding, &[], &Background::default()), None);
     let nothing = ShownPixels::default();
-    let empty = ShownCodes::new(&nothing, &field, &query.canonicals);
+    let empty = ShownCodes::new(&nothing, &field, &CanonicalCosines::new(&field, &query.canonicals));
     assert_eq!(empty.evidence(&query.embedding, &[], &empty.background(&vec![1.0; 100 * DIM])), None);
 }
 

@@ -70,7 +70,14 @@ impl Stage for AnswerQueries {
             }
             // Texts of one form share their alternatives.
             let background = backgrounds.entry(Arc::as_ptr(&query.alternatives.things)).or_insert(None);
-            prepared.answer(&language.field, (&trained.cameras, frames), query, &self.options, background)
+            prepared.answer(
+                &language.field,
+                (&trained.cameras, frames),
+                query,
+                &self.options,
+                background,
+                None,
+            )
         };
         let answers = queries.iter().map(&mut answer).collect();
         context.progress.end();

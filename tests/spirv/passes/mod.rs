@@ -3,6 +3,7 @@
 mod arrays;
 mod frames;
 mod losses;
+mod queries;
 mod stereo;
 
 pub use frames::{bands, image};
@@ -35,6 +36,7 @@ pub const PLAIN: &[(&str, Scene)] = &[
     ("code loss", losses::codes),
     ("ssim and l1", losses::ssim_l1),
     ("plane sweep", stereo::plane_sweep),
+    ("text query", queries::search),
 ];
 
 /// Scenes with float atomics.

@@ -4,7 +4,7 @@ use crate::scene::Image;
 use rayon::prelude::*;
 
 /// Side of the smoothing box, pixels (LERF, LangSplat).
-const BOX: usize = 30;
+pub(super) const BOX: usize = 30;
 
 /// Side of the majority filter of the LERF protocol, pixels.
 const MAJORITY: usize = 7;
@@ -37,7 +37,7 @@ pub fn lerf_mask(blended: &Image<f32>, threshold: f32) -> Image<bool> {
 }
 
 /// Maps an index into 0..n by reflection without repeating the edge.
-fn reflect_101(i: isize, n: usize) -> usize {
+pub(super) fn reflect_101(i: isize, n: usize) -> usize {
     if n == 1 {
         return 0;
     }

@@ -1,7 +1,9 @@
 //! Codes that viewers highlight for a query, in any view.
-use super::{QueryResult, TextQuery, field_relevancy};
-use crate::Result;
-use crate::scene::{Image, LEVEL_NAMES, LanguageField};
+use super::QueryResult;
+use super::maps::CodeMaps;
+use crate::scene::LEVEL_NAMES;
+use std::collections::BTreeSet;
+use std::sync::Arc;
 
 /// Codes that viewers highlight for a query: those of the masks in the views where the text was
 /// found.
@@ -15,37 +17,37 @@ pub struct Highlight {
     pub relevancy: Vec<Vec<f32>>,
 }
 
-/// Combines the answers to `query` in frames with the decoded maps `codes`. The level has the
-/// largest sum of scores over the views that found the text, or over all views if none did.
-pub fn highlight(
-    codes: &[&[Image<i32>]],
-    field: &LanguageField,
-    query: &TextQuery,
-    answers: &[QueryResult],
-) -> Result<Highlight> {
-    let relevancy = field_relevancy(field, query)?;
+/// Combines the answers to a query with this relevancy per level and code in frames with these maps.
+/// The level has the largest sum of scores over the views that found the text, or over all views if
+/// none did.
+pub fn highlight(maps: &[Arc<CodeMaps>], relevancy: Vec<Vec<f32>>, answers: &[QueryResult]) -> Highlight {
     let any = answers.iter().any(|a| a.found);
     let is_counted = |a: &&QueryResult| a.found || !any;
     let mut scores = [0.0; LEVEL_NAMES.len()];
     answers.iter().filter(is_counted).for_each(|a| scores[a.level] += a.score);
     // Ties go to the coarser level: max_by keeps the last maximum.
     let level = (0..scores.len()).max_by(|&a, &b| scores[a].total_cmp(&scores[b])).unwrap_or(0);
-    let mut chosen = vec![false; relevancy.get(level).map_or(0, Vec::len)];
-    for (frame, answer) in codes.iter().zip(answers).filter(|(_, a)| is_counted(a) && a.level == level) {
-        for (&code, _) in frame[level].data.iter().zip(&answer.mask.data).filter(|(_, m)| **m) {
-            if let Some(c) = usize::try_from(code).ok().and_then(|k| chosen.get_mut(k)) {
-                *c = true;
+    let count = relevancy.get(level).map_or(0, Vec::len);
+    let mut codes = BTreeSet::new();
+    for (maps, answer) in maps.iter().zip(answers).filter(|(_, a)| is_counted(a) && a.level == level) {
+        match answer.images.mask_codes() {
+            Some(list) => codes.extend(list.iter().copied()),
+            None => {
+                let (pixels, mask) = (&maps.levels[level].codes, answer.mask());
+                let inside = pixels.iter().zip(&mask.data).filter(|(_, m)| **m);
+                codes.extend(inside.map(|(code, _)| *code));
             }
         }
     }
-    let codes = chosen.iter().enumerate().filter(|(_, c)| **c).map(|(k, _)| k).collect();
-    Ok(Highlight { level, codes, relevancy })
+    let codes = codes.into_iter().map(usize::from).filter(|code| *code < count).collect();
+    Highlight { level, codes, relevancy }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Codebook, LevelField};
+    use crate::query::{AnswerImages, TextQuery, field_relevancy};
+    use crate::scene::{Codebook, Image, LanguageField, LevelField};
 
     /// A level whose codes are unit vectors of the text space itself.
     fn level(rows: &[[f32; 3]]) -> LevelField {
@@ -76,22 +78,23 @@ mod tests {
             vec![map(&[0, 1]), map(&[-1, -1]), map(&[0, 2])],
             vec![map(&[1, 1]), map(&[-1, -1]), map(&[1, 1])],
         );
-        let frames: Vec<&[Image<i32>]> = vec![&first, &second];
+        let frames = [first, second].map(|maps| Arc::new(CodeMaps::new(&maps).unwrap()));
+        let relevancy = field_relevancy(&field, &query).unwrap();
         let answer = |level, found, score, mask: [bool; 2]| QueryResult {
             level,
             found,
             score,
-            mask: Image { width: 2, height: 1, data: mask.to_vec() },
+            images: AnswerImages::of_mask(Image { width: 2, height: 1, data: mask.to_vec() }),
             ..QueryResult::default()
         };
         let seen = [answer(2, true, 0.9, [true, false]), answer(0, false, 0.95, [true, true])];
-        let lit = highlight(&frames, &field, &query, &seen).unwrap();
+        let lit = highlight(&frames, relevancy.clone(), &seen);
         assert_eq!((lit.level, &lit.codes[..]), (2, &[0][..]));
         assert_eq!(lit.relevancy.iter().map(Vec::len).collect::<Vec<_>>(), [2, 0, 3]);
         assert!(lit.relevancy[2][0] > 0.99 && lit.relevancy[2][2] < 0.01, "σ(±10·0.9)");
         // Found nowhere: the level with the higher score.
         let unseen = [answer(2, false, 0.3, [true, false]), answer(0, false, 0.4, [true, true])];
-        let lit = highlight(&frames, &field, &query, &unseen).unwrap();
+        let lit = highlight(&frames, relevancy, &unseen);
         assert_eq!((lit.level, &lit.codes[..]), (0, &[1][..]));
     }
 }

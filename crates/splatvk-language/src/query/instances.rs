@@ -1,10 +1,11 @@
 //! Instances in space: connected groups of the selected splats
 //! (docs/internals/method.md#instances).
+use super::cells;
 use crate::scene::code_mix::MIN_LENGTH;
 use crate::scene::{Camera, Image, LanguageField, LevelField, Splats};
-use ahash::{HashMap, HashMapExt}; // quicker than the standard library's: a query looks up cells some million times
-use glam::{DMat3, DQuat, DVec2, DVec3, IVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
+use std::cmp::Ordering;
 
 /// Side of a cell, in median radii of the selected splats: touching cells belong to one instance.
 /// On the data of [`LEAST_SHARE`], 3 to 8 give the same instances; with 2 more fragments are
@@ -45,8 +46,48 @@ pub struct Places {
     weights: Vec<f64>,
     /// Per level [N] agreement of the photos on every splat, in 0..1; empty if unknown.
     reliability: Vec<Vec<f32>>,
-    /// Per level [N] code of every splat.
-    codes: Vec<Vec<Option<usize>>>,
+    /// Per level the splats of every code.
+    lists: Vec<CodeLists>,
+}
+
+/// The splats of every code of a level.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct CodeLists {
+    /// [K + 1] first entry of each code.
+    starts: Vec<usize>,
+    /// Splats by code, ascending within a code.
+    splats: Vec<u32>,
+}
+
+impl CodeLists {
+    fn new(codes: &[Option<usize>]) -> CodeLists {
+        let count = codes.iter().flatten().max().map_or(0, |k| k + 1);
+        let mut starts = vec![0; count + 1];
+        codes.iter().flatten().for_each(|&k| starts[k + 1] += 1);
+        for k in 0..count {
+            starts[k + 1] += starts[k];
+        }
+        let (mut next, mut splats) = (starts.clone(), vec![0; starts[count]]);
+        for (i, &k) in codes.iter().enumerate().filter_map(|(i, k)| Some((i, k.as_ref()?))) {
+            splats[next[k]] = i as u32;
+            next[k] += 1;
+        }
+        CodeLists { starts, splats }
+    }
+
+    /// Number of splats of each code.
+    pub fn counts(&self) -> impl Iterator<Item = usize> + '_ {
+        self.starts.windows(2).map(|s| s[1] - s[0])
+    }
+
+    /// Splats of some codes, ascending.
+    pub fn splats_of(&self, codes: impl Iterator<Item = usize>) -> Vec<usize> {
+        let list = |k: usize| self.splats.get(*self.starts.get(k)?..*self.starts.get(k + 1)?);
+        let mut all: Vec<usize> = codes.filter_map(list).flatten().map(|&i| i as usize).collect();
+        // A stable sort merges the ascending lists.
+        all.sort();
+        all
+    }
 }
 
 /// A box along the principal axes of a thing, largest variance first.
@@ -91,13 +132,13 @@ impl Places {
             weights: splats.opacity_logits.iter().map(opacity).collect(),
             reliability: field.levels.iter().map(|l| l.reliability.clone()).collect(),
             spans,
-            codes: field.levels.iter().map(splat_codes).collect(),
+            lists: field.levels.iter().map(|level| CodeLists::new(&splat_codes(level))).collect(),
         }
     }
 
-    /// Per level the code of every splat.
-    pub fn codes(&self) -> &[Vec<Option<usize>>] {
-        &self.codes
+    /// Per level the splats of every code.
+    pub fn lists(&self) -> &[CodeLists] {
+        &self.lists
     }
 
     /// Connected groups of the splats `chosen` on a level, heaviest first.
@@ -121,31 +162,8 @@ impl Places {
         let Some(cell) = crate::math::median(&mut radii).map(|r| CELL * r).filter(|c| *c > 0.0) else {
             return Vec::new();
         };
-        let cell_of = |p: DVec3| (p / cell).floor().as_ivec3();
-        let mut cells: HashMap<IVec3, usize> = HashMap::new();
-        for &i in chosen {
-            for point in covered(self.centres[i], self.spans[i], cell) {
-                let next = cells.len();
-                cells.entry(cell_of(point)).or_insert(next);
-            }
-        }
-        let mut union = Union::new(cells.len());
-        for (cell, &a) in &cells {
-            // Half of the 26 neighbours: the other half visits the same pairs.
-            for step in 14..27 {
-                let near = *cell + IVec3::new(step % 3, step / 3 % 3, step / 9) - IVec3::ONE;
-                if let Some(&b) = cells.get(&near) {
-                    union.join(a, b);
-                }
-            }
-        }
-        let mut groups: HashMap<usize, Vec<usize>> = HashMap::new();
-        for &i in chosen {
-            if let Some(&index) = cells.get(&cell_of(self.centres[i])) {
-                groups.entry(union.root(index)).or_default().push(i);
-            }
-        }
-        groups.into_values().collect()
+        let points = |i: usize| covered(self.centres[i], self.spans[i], cell);
+        cells::groups(chosen, cell, points, |i| self.centres[i])
     }
 
     fn instance(&self, splats: Vec<usize>, share: f64, level: usize) -> Instance {
@@ -185,11 +203,11 @@ impl Places {
 
     /// Range of the splats along an axis, without [`OUTSIDE`] of the weight on each side.
     fn extent(&self, splats: &[usize], axis: DVec3) -> [f64; 2] {
-        let mut sorted: Vec<(f64, f64)> =
+        let mut along: Vec<(f64, f64)> =
             splats.iter().map(|&i| (axis.dot(self.centres[i]), self.weights[i])).collect();
-        sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let outside = OUTSIDE * sorted.iter().map(|a| a.1).sum::<f64>();
-        [first_inside(sorted.iter(), outside), first_inside(sorted.iter().rev(), outside)]
+        let outside = OUTSIDE * along.iter().map(|a| a.1).sum::<f64>();
+        let low = first_inside(&mut along, outside, f64::total_cmp);
+        [low, first_inside(&mut along, outside, |a, b| b.total_cmp(a))]
     }
 
     /// Weighted mean of the photos' agreement on splats; `None` if unknown.
@@ -200,9 +218,10 @@ impl Places {
         (sums.0 > 0.0).then(|| sums.1 / sums.0)
     }
 
-    /// Splats of `splats` that are visible in a view.
-    pub fn seen_of(&self, splats: &[usize], camera: &Camera, depth: &Image<f32>) -> Vec<usize> {
-        splats.iter().copied().filter(|i| self.visible_pixel(*i, camera, depth).is_some()).collect()
+    /// Splats of `splats` that are visible in a view, with the pixels of their centres.
+    pub fn visible(&self, splats: &[usize], camera: &Camera, depth: &Image<f32>) -> Visible {
+        let pixel = |&i: &usize| Some((i, self.visible_pixel(i, camera, depth)?));
+        Visible(splats.par_iter().with_min_len(2048).filter_map(pixel).collect())
     }
 
     /// Pixel of a splat's centre in a view, if it is visible.
@@ -215,9 +234,10 @@ impl Places {
     }
 
     /// Pixel of a view that shows a thing: of its visible splats, the one nearest to their mean.
-    pub fn pixel(&self, instance: &Instance, camera: &Camera, depth: &Image<f32>) -> Option<[f64; 2]> {
-        let pixel = |&i: &usize| Some((self.visible_pixel(i, camera, depth)?, self.weights[i]));
-        let seen: Vec<_> = instance.splats.iter().filter_map(pixel).collect();
+    /// `visible` has the visible splats of the view.
+    pub fn pixel(&self, instance: &Instance, visible: &Visible) -> Option<[f64; 2]> {
+        let seen: Vec<(DVec2, f64)> =
+            visible.of(&instance.splats).map(|(i, pixel)| (pixel, self.weights[i])).collect();
         let total: f64 = seen.iter().map(|s| s.1).sum();
         let mean = seen.iter().map(|(p, w)| *p * *w).sum::<DVec2>() / total;
         let nearest = seen
@@ -225,6 +245,27 @@ impl Places {
             .map(|s| s.0)
             .min_by(|a, b| a.distance_squared(mean).total_cmp(&b.distance_squared(mean)));
         nearest.map(|p| [p.x, p.y])
+    }
+}
+
+/// Splats that a view shows, ascending, with the pixels of their centres.
+#[derive(Clone, Debug, Default)]
+pub struct Visible(Vec<(usize, DVec2)>);
+
+impl Visible {
+    /// The splats.
+    pub fn splats(&self) -> Vec<usize> {
+        self.0.iter().map(|s| s.0).collect()
+    }
+
+    /// Those of `splats`, ascending.
+    fn of<'a>(&'a self, splats: &'a [usize]) -> impl Iterator<Item = (usize, DVec2)> + 'a {
+        let mut rest = splats;
+        self.0.iter().copied().filter(move |(i, _)| {
+            let skipped = rest.iter().take_while(|own| **own < *i).count();
+            rest = &rest[skipped..];
+            rest.first() == Some(i)
+        })
     }
 }
 
@@ -238,14 +279,23 @@ fn longest_half_axes(splats: &Splats, i: usize) -> [DVec3; 2] {
     [half[0], half[1]]
 }
 
-/// First position of (position, weight) pairs at which the summed weight exceeds `outside`.
-fn first_inside<'a>(mut sorted: impl Iterator<Item = &'a (f64, f64)>, outside: f64) -> f64 {
-    let mut passed = 0.0;
-    let found = sorted.find(|(_, weight)| {
-        passed += weight;
-        passed > outside
-    });
-    found.map_or(0.0, |f| f.0)
+/// First position in an order of (position, weight) pairs at which the summed weight exceeds
+/// `outside`; 0 if none does. Reorders the pairs. Halves that cannot have it are not sorted.
+fn first_inside(pairs: &mut [(f64, f64)], outside: f64, order: fn(&f64, &f64) -> Ordering) -> f64 {
+    let (mut rest, mut passed) = (pairs, 0.0);
+    while rest.len() > 1 {
+        let middle = rest.len() / 2;
+        rest.select_nth_unstable_by(middle, |a, b| order(&a.0, &b.0));
+        let (before, behind) = rest.split_at_mut(middle);
+        let weight: f64 = before.iter().map(|p| p.1).sum();
+        if passed + weight > outside {
+            rest = before;
+        } else {
+            passed += weight;
+            rest = behind;
+        }
+    }
+    rest.first().filter(|p| passed + p.1 > outside).map_or(0.0, |p| p.0)
 }
 
 /// Points of a splat at most a cell apart: large splats occupy several cells.
@@ -256,26 +306,6 @@ fn covered(centre: DVec3, [a, b]: [DVec3; 2], cell: f64) -> impl Iterator<Item =
     let (u, v) = (steps(a).max(0), steps(b).max(0));
     let share = move |k: i32, n: i32| if n > 0 { f64::from(k) / f64::from(n) } else { 0.0 };
     (-u..=u).flat_map(move |i| (-v..=v).map(move |j| centre + a * share(i, u) + b * share(j, v)))
-}
-
-/// Disjoint sets.
-struct Union(Vec<usize>);
-
-impl Union {
-    fn new(count: usize) -> Union {
-        Union((0..count).collect())
-    }
-    fn root(&mut self, mut i: usize) -> usize {
-        while self.0[i] != i {
-            self.0[i] = self.0[self.0[i]];
-            i = self.0[i];
-        }
-        i
-    }
-    fn join(&mut self, a: usize, b: usize) {
-        let (a, b) = (self.root(a), self.root(b));
-        self.0[a.max(b)] = a.min(b);
-    }
 }
 
 #[cfg(test)]
@@ -299,5 +329,35 @@ mod tests {
         let places = Places::of(&splats, &LanguageField::default());
         let found = places.instances(&(0..count).collect::<Vec<_>>(), 0);
         assert_eq!(found.iter().map(|i| i.splats.len()).collect::<Vec<_>>(), [20, 10]);
+    }
+
+    #[test]
+    fn first_inside_equals_that_of_sorted_pairs() {
+        let mut random = crate::math::Random::new(4);
+        for count in [1usize, 2, 7, 500] {
+            // Whole weights have exact sums in any order; positions repeat.
+            let pairs: Vec<(f64, f64)> =
+                (0..count).map(|_| (random.below(40) as f64, random.below(9) as f64)).collect();
+            let total: f64 = pairs.iter().map(|p| p.1).sum();
+            for outside in [0.0, 0.02 * total, 0.5 * total, total] {
+                let mut sorted = pairs.clone();
+                sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
+                let mut passed = 0.0;
+                let first = sorted.iter().find(|p| {
+                    passed += p.1;
+                    passed > outside
+                });
+                let got = first_inside(&mut pairs.clone(), outside, f64::total_cmp);
+                assert_eq!(got, first.map_or(0.0, |p| p.0), "{count} {outside}");
+            }
+        }
+    }
+
+    #[test]
+    fn lists_have_splats_of_codes_in_order() {
+        let lists = CodeLists::new(&[Some(2), None, Some(0), Some(2), Some(4), Some(0)]);
+        assert_eq!(lists.counts().collect::<Vec<_>>(), [2, 0, 2, 0, 1]);
+        assert_eq!(lists.splats_of([0, 2, 3, 9].into_iter()), [0, 2, 3, 5]);
+        assert!(CodeLists::default().splats_of([0].into_iter()).is_empty());
     }
 }

@@ -1,8 +1,10 @@
 //! Conformal test of whether a scene shows the thing that a text names
 //! (docs/internals/method.md#presence). The text is compared with names of other things; one that
 //! fits the scene no better than they do is no evidence.
+use super::CanonicalCosines;
+use super::maps::CodeMaps;
 use crate::math::dot_f32 as dot;
-use crate::scene::{Image, LanguageField};
+use crate::scene::LanguageField;
 use rayon::prelude::*;
 use serde::Serialize;
 use std::sync::Arc;
@@ -74,27 +76,27 @@ pub struct ShownPixels {
 }
 
 impl ShownPixels {
-    /// Counts a view; `maps` holds its decoded map per level.
-    pub fn add(&mut self, field: &LanguageField, maps: &[Image<i32>]) {
+    /// Counts a view with these maps.
+    pub fn add(&mut self, field: &LanguageField, maps: &CodeMaps) {
         self.codes.resize(field.levels.len(), Vec::new());
         self.all.resize(field.levels.len(), 0);
         for (((counts, all), level), map) in
-            self.codes.iter_mut().zip(&mut self.all).zip(&field.levels).zip(maps)
+            self.codes.iter_mut().zip(&mut self.all).zip(&field.levels).zip(&maps.levels)
         {
             counts.resize(level.codebook.len(), 0);
-            *all += map.data.len();
-            for code in &map.data {
-                if let Some(n) = usize::try_from(*code).ok().and_then(|k| counts.get_mut(k)) {
-                    *n += 1;
+            *all += map.codes.len();
+            for shown in &map.shown {
+                if let Some(n) = counts.get_mut(usize::from(shown.code)) {
+                    *n += shown.pixels;
                 }
             }
         }
     }
 
     /// Counts several views.
-    pub fn of(field: &LanguageField, views: &[&[Image<i32>]]) -> ShownPixels {
+    pub fn of<'m>(field: &LanguageField, views: impl IntoIterator<Item = &'m CodeMaps>) -> ShownPixels {
         let mut shown = ShownPixels::default();
-        views.iter().for_each(|maps| shown.add(field, maps));
+        views.into_iter().for_each(|maps| shown.add(field, maps));
         shown
     }
 }
@@ -107,16 +109,15 @@ pub struct ShownCodes<'f> {
 
 impl<'f> ShownCodes<'f> {
     /// Collects the visible codes of `field` without specks.
-    pub fn new(shown: &ShownPixels, field: &'f LanguageField, canonicals: &[f32]) -> ShownCodes<'f> {
+    pub fn new(shown: &ShownPixels, field: &'f LanguageField, cosines: &CanonicalCosines) -> ShownCodes<'f> {
         let mut codes = Vec::new();
-        for ((level, shown), all) in field.levels.iter().zip(&shown.codes).zip(&shown.all) {
+        let levels = field.levels.iter().zip(&cosines.short);
+        for (((level, common), shown), all) in levels.zip(&shown.codes).zip(&shown.all) {
             let book = &level.codebook;
             let least = LEAST_SHARE * *all as f64;
-            let rows = book.embeddings.chunks_exact(book.embedding_dim.max(1)).zip(shown);
-            codes.extend(rows.filter(|(_, n)| **n > 0 && **n as f64 >= least).map(|(row, _)| {
-                let common = canonicals.chunks_exact(row.len()).map(|c| dot(row, c));
-                (row, common.fold(f32::NEG_INFINITY, f32::max))
-            }));
+            let rows = book.embeddings.chunks_exact(book.embedding_dim.max(1)).zip(common).zip(shown);
+            let kept = rows.filter(|(_, n)| **n > 0 && **n as f64 >= least);
+            codes.extend(kept.map(|((row, common), _)| (row, *common)));
         }
         ShownCodes { codes }
     }

@@ -1,9 +1,8 @@
 //! Selects the splats that answer a query in space, without any view
 //! (docs/internals/method.md#selection-in-space).
 use super::instances::Places;
-use super::{MaskRule, QueryOptions, TextQuery, field_relevancy, margin};
-use crate::Result;
-use crate::scene::LanguageField;
+use super::score::margin;
+use super::{MaskRule, QueryOptions};
 
 /// Smallest number of splats of a code. Smaller codes are specks: at a pixel per splat, below the
 /// smallest mask.
@@ -23,45 +22,39 @@ pub struct Selection {
     pub found: bool,
 }
 
-/// Selects by the rule of the `field` masks: the coarsest level that is nearly as good as the best
+/// Selects by relevancy per level and code with the rule of the `field` masks: the coarsest level that is nearly as good as the best
 /// one, and its codes that are nearly as relevant as the best.
-pub fn select(
-    field: &LanguageField,
-    places: &Places,
-    query: &TextQuery,
-    options: &QueryOptions,
-) -> Result<Selection> {
-    let relevancy = field_relevancy(field, query)?;
-    let mut found: Vec<(usize, f32, &[Option<usize>])> = Vec::new();
-    for (l, (codes, values)) in places.codes().iter().zip(&relevancy).enumerate() {
-        let mut carried = vec![0usize; values.len()];
-        codes.iter().flatten().for_each(|&k| carried[k] += 1);
-        let solid = values.iter().zip(&carried).filter(|(_, n)| **n >= MIN_SPLATS).map(|(v, _)| *v);
-        if let Some(best) = solid.reduce(f32::max) {
-            found.push((l, best, codes));
+pub fn select(places: &Places, relevancy: &[Vec<f32>], options: &QueryOptions) -> Selection {
+    let (mut levels, mut best): (Vec<usize>, Vec<f32>) = Default::default();
+    for (l, (lists, values)) in places.lists().iter().zip(relevancy).enumerate() {
+        let solid = values.iter().zip(lists.counts()).filter(|(_, n)| *n >= MIN_SPLATS).map(|(v, _)| *v);
+        if let Some(top) = solid.reduce(f32::max) {
+            levels.push(l);
+            best.push(top);
         }
     }
-    let peaks: Vec<f32> = found.iter().map(|f| margin(f.1)).collect();
+    let peaks: Vec<f32> = best.iter().map(|top| margin(*top)).collect();
     let chosen = match options.mask {
         MaskRule::Codes(_) => super::coarsest_good(&peaks, options.slack),
         MaskRule::Lerf(_) => super::first_best(&peaks),
     };
-    let Some(chosen) = chosen else { return Ok(Selection::default()) };
-    let (level, score, codes) = &found[chosen];
+    let Some(chosen) = chosen else { return Selection::default() };
+    let (level, score) = (levels[chosen], best[chosen]);
     let share = match options.mask {
         MaskRule::Codes(share) => share,
         MaskRule::Lerf(_) => super::CODE_SHARE,
     };
-    let bar = super::code_bar(*score, share);
-    let answers = |k: &Option<usize>| k.is_some_and(|k| relevancy[*level][k] >= bar);
-    let splats = codes.iter().enumerate().filter(|(_, k)| answers(k)).map(|(i, _)| i).collect();
-    Ok(Selection { level: *level, splats, score: *score, found: *score >= options.abs_threshold })
+    let bar = super::code_bar(score, share);
+    let answers = relevancy[level].iter().enumerate().filter(|(_, r)| **r >= bar).map(|(k, _)| k);
+    let splats = places.lists()[level].splats_of(answers);
+    Selection { level, splats, score, found: score >= options.abs_threshold }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Codebook, LevelField, Splats};
+    use crate::query::{TextQuery, field_relevancy};
+    use crate::scene::{Codebook, LanguageField, LevelField, Splats};
 
     #[test]
     fn select_uses_coarsest_good_level() {
@@ -85,16 +78,11 @@ mod tests {
         };
         let options = QueryOptions::default();
         let places = Places::of(&Splats::default(), &field);
-        let thing = select(&field, &places, &query([1.0, 0.0, 0.0, 0.0]), &options).unwrap();
+        let ask = |v: [f32; 4]| select(&places, &field_relevancy(&field, &query(v)).unwrap(), &options);
+        let thing = ask([1.0, 0.0, 0.0, 0.0]);
         assert_eq!((thing.level, thing.found), (1, true));
         assert_eq!(thing.splats, (0..80).collect::<Vec<_>>());
-        let other = select(&field, &places, &query([0.0, 1.0, 0.0, 0.0]), &options).unwrap();
-        assert_eq!(other.splats, (80..120).collect::<Vec<_>>());
-        assert!(
-            select(&LanguageField::default(), &Places::default(), &query([1.0, 0.0, 0.0, 0.0]), &options)
-                .unwrap()
-                .splats
-                .is_empty()
-        );
+        assert_eq!(ask([0.0, 1.0, 0.0, 0.0]).splats, (80..120).collect::<Vec<_>>());
+        assert!(select(&Places::default(), &[], &options).splats.is_empty());
     }
 }

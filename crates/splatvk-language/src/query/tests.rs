@@ -1,4 +1,8 @@
+use super::frame::HostSearch;
+use super::maps::CodeMaps;
 use super::*;
+use crate::scene::{Codebook, Image, LanguageField, LevelField};
+use std::sync::Arc;
 
 fn unit(v: &[f32]) -> Vec<f32> {
     let n = v.iter().map(|x| x * x).sum::<f32>().sqrt();
@@ -69,20 +73,22 @@ fn answer_mask_follows_code_borders() {
     let lerf = QueryOptions { mask: MaskRule::Lerf(0.6), ..QueryOptions::default() };
     let r1 = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &lerf).unwrap();
     assert_eq!(r1.level, 1, "protocol lerf: ties go to the finer level, empty levels are skipped");
+    let mask = r.mask();
     for (p, &k) in maps[1].data.iter().enumerate() {
-        assert_eq!(r.mask.data[p], k == 0 || k == 2, "pixel {p}");
+        assert_eq!(mask.data[p], k == 0 || k == 2, "pixel {p}");
     }
     assert!(maps[1].at(r.location.0, r.location.1) != 1 && r.found && r.score > 0.95);
-    assert_eq!(r.relevancy.data.len(), 2400);
+    assert_eq!(r.relevancy().data.len(), 2400);
+    assert_eq!(r.mask_pixels(), mask.data.iter().filter(|m| **m).count());
     // raising the bar to the very best code leaves out its near-copy
     let strict = QueryOptions { mask: MaskRule::Codes(1.0), ..QueryOptions::default() };
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &strict).unwrap();
-    assert!(maps[1].data.iter().zip(&r.mask.data).all(|(&k, &m)| m == (k == 0)));
+    assert!(maps[1].data.iter().zip(&r.mask().data).all(|(&k, &m)| m == (k == 0)));
     // without that code in the view, its near-copy is the best
     let mut maps = maps;
     maps.iter_mut().flat_map(|m| &mut m.data).filter(|k| **k == 0).for_each(|k| *k = 1);
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &strict).unwrap();
-    assert!(maps[1].data.iter().zip(&r.mask.data).all(|(&k, &m)| m == (k == 2)));
+    assert!(maps[1].data.iter().zip(&r.mask().data).all(|(&k, &m)| m == (k == 2)));
 }
 
 #[test]
@@ -127,13 +133,22 @@ fn answer_prefers_clearly_better_part() {
 
 #[test]
 fn answer_all_equals_single_answers() {
-    let (one, two) = (vec![frame(), frame(), frame()], vec![Image::filled(60, 40, -1), frame(), frame()]);
-    let q = query(&[1.0, 0.0, 0.0, 0.0]);
-    let together = answer_all(&[&one, &two], &field(), &q, &QueryOptions::default()).unwrap();
-    for (codes, all) in [&one, &two].into_iter().zip(&together) {
-        let alone = answer(codes, &field(), &q, &QueryOptions::default()).unwrap();
-        assert_eq!((alone.level, alone.location, &alone.mask), (all.level, all.location, &all.mask));
-        assert_eq!(alone.relevancy, all.relevancy);
+    let (one, two) = ([frame(), frame(), frame()], [Image::filled(60, 40, -1), frame(), frame()]);
+    let (field, q, options) = (field(), query(&[1.0, 0.0, 0.0, 0.0]), QueryOptions::default());
+    let frames = [&one, &two].map(|codes| Arc::new(CodeMaps::new(codes).unwrap()));
+    let relevancy = field_relevancy(&field, &q).unwrap();
+    let together = answer_all(&frames, &relevancy, &options, None).unwrap();
+    // The search of a device finds the peaks of all levels before one is chosen.
+    let searched = answer_all(&frames, &relevancy, &options, Some(&mut HostSearch(&frames))).unwrap();
+    for ((codes, all), searched) in [&one, &two].into_iter().zip(&together).zip(&searched) {
+        let alone = answer(codes, &field, &q, &options).unwrap();
+        for other in [all, searched] {
+            assert_eq!(
+                (alone.level, alone.location, alone.mask()),
+                (other.level, other.location, other.mask())
+            );
+            assert_eq!(alone.relevancy(), other.relevancy());
+        }
     }
 }
 
@@ -150,7 +165,7 @@ fn answer_unrelated_text_is_not_found() {
 fn answer_void_frame_has_empty_mask() {
     let maps = vec![Image::filled(60, 40, -1); 3];
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
-    assert!(!r.found && r.mask.data.iter().all(|m| !m));
+    assert!(!r.found && r.mask().data.iter().all(|m| !m));
 }
 
 /// Distinct unit vectors per object that share a strong common direction, as image features of one
@@ -217,7 +232,7 @@ fn answer_distinct_features_find_every_phrase() {
             let r = answer(&maps, &built.field, &query, &QueryOptions::default()).unwrap();
             if view.masks.data.contains(object) {
                 assert!(
-                    view.masks.data.iter().zip(&r.mask.data).all(|(k, &m)| m == (k == object)),
+                    view.masks.data.iter().zip(&r.mask().data).all(|(k, &m)| m == (k == object)),
                     "{text} {t}"
                 );
                 assert_eq!(view.masks.at(r.location.0, r.location.1), *object);
@@ -240,4 +255,101 @@ fn answer_location_respects_finer_level() {
     let r = answer(&maps, &field(), &query(&[1.0, 0.0, 0.0, 0.0]), &QueryOptions::default()).unwrap();
     assert_eq!(r.level, 2);
     assert!((120..180).contains(&r.location.0) && (20..100).contains(&r.location.1), "{:?}", r.location);
+}
+
+/// [`answer_with`] for [`MaskRule::Codes`] in plain steps over whole images of f32.
+struct PlainAnswer {
+    level: usize,
+    score: f32,
+    relevancy: Image<f32>,
+    mask: Image<bool>,
+    /// Summed relevancy of all levels in the box of every pixel.
+    evidence: Image<f32>,
+    /// Value of every level.
+    peaks: Vec<f32>,
+}
+
+fn plain_answer(codes: &[Image<i32>], relevancy: &[Vec<f32>], share: f32) -> PlainAnswer {
+    let highest = |map: &Image<f32>| map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let smooth = |map: &Image<f32>| filter::blend(map, &filter::box30(map));
+    let raw: Vec<Image<f32>> = codes.iter().zip(relevancy).map(|(m, r)| relevancy_map(m, r)).collect();
+    let peaks: Vec<f32> = raw
+        .iter()
+        .map(|raw| {
+            let data = raw.data.iter().map(|v| (2.0 * v - 1.0).max(0.0)).collect();
+            let peak = highest(&smooth(&Image { data, ..*raw }));
+            score::margin(if peak > 0.0 { 0.5 + 0.5 * peak } else { highest(raw).min(0.5) })
+        })
+        .collect();
+    let level = coarsest_good(&peaks, SLACK).unwrap();
+    let value = |k: i32| usize::try_from(k).ok().and_then(|k| relevancy[level].get(k)).copied();
+    let top = codes[level].data.iter().filter_map(|k| value(*k)).fold(0.0, f32::max);
+    let bar = code_bar(top, share);
+    let mask = codes[level].data.iter().map(|k| value(*k).is_some_and(|r| r > 0.0 && r >= bar));
+    let mut sum = raw[0].clone();
+    for other in &raw[1..] {
+        sum.data.iter_mut().zip(&other.data).for_each(|(s, v)| *s += v);
+    }
+    PlainAnswer {
+        level,
+        score: highest(&raw[level]).max(0.0),
+        relevancy: smooth(&raw[level]),
+        mask: Image { width: sum.width, height: sum.height, data: mask.collect() },
+        evidence: filter::box30(&sum),
+        peaks,
+    }
+}
+
+/// A map of rectangles of random codes, some void, with single pixels of others.
+fn random_map(random: &mut crate::math::Random, [width, height]: [usize; 2], codes: usize) -> Image<i32> {
+    let mut map = Image::filled(width, height, random.below(codes + 1) as i32 - 1);
+    for k in 0..40 {
+        let (x, y) = (random.below(width), random.below(height));
+        let edge = if k < 20 { 1 + random.below(width.max(height) / 2 + 1) } else { 1 };
+        let code = random.below(codes + 1) as i32 - 1;
+        for y in y..(y + edge).min(height) {
+            map.data[y * width + x..y * width + (x + edge).min(width)].fill(code);
+        }
+    }
+    map
+}
+
+#[test]
+fn answers_equal_plain_steps_on_random_maps() {
+    let mut random = crate::math::Random::new(9);
+    let (mut levels, mut partial) = ([0; 3], 0);
+    for trial in 0..60 {
+        let size = [[97, 71], [20, 9], [33, 130], [160, 31]][trial % 4];
+        let counts = [12, 8, 4];
+        let codes = counts.map(|count| random_map(&mut random, size, count));
+        // The last code of a level is unknown to the codebook. Every third trial fits nothing.
+        let most = if trial % 3 == 2 { 0.5 } else { 0.98 };
+        let relevancy: Vec<Vec<f32>> = counts
+            .iter()
+            .map(|count| (1..*count).map(|_| most * random.uniform().powi(2) as f32).collect())
+            .collect();
+        let plain = plain_answer(&codes, &relevancy, CODE_SHARE);
+        let got = answer_with(&codes, &relevancy, &QueryOptions::default()).unwrap();
+        let top = plain.peaks.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+        let bar = ((1.0 - SLACK.share) * top - SLACK.margin).max(0.0);
+        // Margins within rounding of the bar may fall on either side.
+        if plain.peaks.iter().any(|p| (p - bar).abs() < 1e-4 || (p - top).abs() < 1e-4 && *p != top) {
+            continue;
+        }
+        assert_eq!((got.level, got.score, got.mask()), (plain.level, plain.score, plain.mask), "{trial}");
+        levels[got.level] += 1;
+        let (mask, relevancy) = (got.mask(), got.relevancy());
+        let difference = relevancy.data.iter().zip(&plain.relevancy.data).map(|(a, b)| (a - b).abs());
+        // Half a unit of 2⁻²⁰, and rounding to f32.
+        assert!(difference.fold(0.0, f32::max) < 7e-7, "{trial}");
+        let any = mask.data.contains(&true);
+        partial += usize::from(any && mask.data.contains(&false));
+        let evidence = |p: usize| plain.evidence.data[p];
+        let inside = (0..mask.data.len()).filter(|p| !any || mask.data[*p]);
+        let best = inside.map(evidence).fold(f32::NEG_INFINITY, f32::max);
+        let own = got.location.1 * size[0] + got.location.0;
+        assert!((!any || mask.data[own]) && best - evidence(own) < 3e-6, "{trial}");
+        assert_eq!(got.mask_pixels(), mask.data.iter().filter(|m| **m).count());
+    }
+    assert!(levels.iter().all(|n| *n > 0) && partial > 20, "{levels:?} {partial}");
 }
