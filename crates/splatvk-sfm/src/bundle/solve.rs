@@ -13,6 +13,8 @@ const TOLERANCE: f64 = 1e-6;
 /// Relative decrease of the cost from which on the steps use [`Curvature::Robust`]. Larger steps
 /// move observations in and out of the flat part of the loss.
 const NEAR: f64 = 1e-3;
+/// Relative decrease of the cost up to which points move to their optimum after each step.
+const FAR: f64 = 0.03;
 /// Damping of the first step.
 const DAMPING: f64 = 1e-4;
 /// Least damping.
@@ -27,6 +29,8 @@ struct Descent {
     cost: f64,
     lambda: f64,
     curvature: Curvature,
+    /// Whether the cameras are so far off that points at their optimum would follow their errors.
+    far: bool,
     /// Number of trial steps so far.
     trials: usize,
 }
@@ -37,14 +41,14 @@ impl Problem {
         if self.poses.len() < 2 || self.observations.is_empty() {
             return Err(Error::work("bundle adjustment: needs two cameras with common points"));
         }
-        // Points of other cameras are far from their optimum, which is cheap to find.
-        let given = self.points.clone();
-        let cost = self.relax_points(&given, c, Curvature::Weighted);
-        let mut descent = Descent { c, cost, lambda: DAMPING, curvature: Curvature::Weighted, trials: 0 };
+        let cost = self.cost(c);
+        let mut descent =
+            Descent { c, cost, lambda: DAMPING, curvature: Curvature::Weighted, far: true, trials: 0 };
         for _ in 0..max_steps {
             let before = descent.cost;
             self.descend(&mut descent);
             let gain = (before - descent.cost) / before;
+            descent.far = gain > FAR;
             // Where the loss bends the other way, only steps by the weights lead down.
             let failed = gain <= 0.0 && descent.curvature == Curvature::Robust;
             if gain <= TOLERANCE && !failed {
@@ -64,7 +68,10 @@ impl Problem {
         for _ in 0..trials {
             descent.trials += 1;
             if self.step(&normal, descent.lambda) {
-                let cost = self.relax_points(&points, descent.c, descent.curvature);
+                let cost = match descent.far {
+                    true => self.cost(descent.c),
+                    false => self.relax_points(&points, descent.c, descent.curvature),
+                };
                 if cost < descent.cost {
                     descent.cost = cost;
                     descent.lambda = (descent.lambda * 0.2).max(LEAST_DAMPING);

@@ -66,7 +66,6 @@ fn solve_recovers_truth_despite_outliers() {
 
 #[test]
 fn solve_takes_few_steps() {
-    // By weights alone, the steps converge linearly: 22 trials here, and 47 with the outliers.
     let (mut p, _) = scene(1.0);
     let plain = p.solve(2.0, 60).unwrap();
     let (mut p, _) = scene(1.0);
@@ -76,10 +75,10 @@ fn solve_takes_few_steps() {
     }
     let spoilt = p.solve(2.0, 60).unwrap();
     println!("{} and {} trials", plain.trials, spoilt.trials);
-    // Both ends are optima.
+    // Steps by the weights alone converge linearly and take dozens.
+    assert!(plain.trials <= 12 && spoilt.trials <= 14, "{} {}", plain.trials, spoilt.trials);
     let again = p.solve(2.0, 60).unwrap();
-    assert!(again.cost > spoilt.cost * (1.0 - 1e-5), "{} {}", again.cost, spoilt.cost);
-    assert!(plain.trials <= 10 && spoilt.trials <= 20, "{} {}", plain.trials, spoilt.trials);
+    assert!(again.cost > spoilt.cost * (1.0 - 1e-3), "{} {}", again.cost, spoilt.cost);
 }
 
 #[test]

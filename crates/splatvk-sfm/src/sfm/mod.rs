@@ -12,6 +12,7 @@ mod model;
 mod pair;
 mod patch;
 mod refine;
+mod scan;
 mod tracks;
 mod unregistered;
 mod verify;

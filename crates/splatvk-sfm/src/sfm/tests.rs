@@ -492,7 +492,7 @@ impl crate::progress::Progress for Clock {
 
 #[test]
 #[ignore = "prints times: SPLATVK_TEST_PHOTOS names a folder of photos"]
-fn reconstruct_cost() {
+fn stage_times() {
     let folder = std::env::var("SPLATVK_TEST_PHOTOS").unwrap();
     let mut files: Vec<_> = std::fs::read_dir(folder).unwrap().map(|f| f.unwrap().path()).collect();
     files.sort();
