@@ -7,6 +7,13 @@ pub(crate) fn cauchy_weight(r2: f64, c: f64) -> f64 {
     1.0 / (1.0 + r2 / (c * c))
 }
 
+/// Second derivative of the Cauchy loss along the residual, over its weight, from r²; negative
+/// beyond c.
+pub(crate) fn cauchy_curvature(r2: f64, c: f64) -> f64 {
+    let s = r2 / (c * c);
+    (1.0 - s) / (1.0 + s)
+}
+
 /// Cauchy loss, from r².
 pub(crate) fn cauchy(r2: f64, c: f64) -> f64 {
     c * c * (r2 / (c * c)).ln_1p()

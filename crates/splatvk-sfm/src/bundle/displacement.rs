@@ -1,7 +1,7 @@
 //! Effect of smooth image displacements on the result. They stand for everything that a projection
 //! leaves out (a lens that is not quite radial, a rolling shutter, a sensor or a paper that is not
 //! flat) and that more observations do not average out.
-use super::normal::Normal;
+use super::normal::{Curvature, Normal};
 use super::{INTRINSICS, Problem};
 use glam::{DVec2, DVec3};
 use nalgebra::DMatrix;
@@ -36,7 +36,7 @@ impl Problem {
         half_long: &[f64],
         by: &[f64],
     ) -> Option<DisplacementSigmas> {
-        let normal = self.linearise(c);
+        let normal = self.linearise(c, Curvature::Weighted);
         let moved = self.covariance(&normal)? * self.gradients(&normal, c, half_long, by);
         let deviation = |row: usize| moved.row(row).norm();
         let (poses, _) = self.sizes();
@@ -67,11 +67,11 @@ impl Problem {
         for (seen, block) in of_points.zip(&normal.points) {
             let inverse = block.inverse(0.0);
             for o in seen {
-                let Some(d) = self.derivatives(o, c) else { continue };
+                let Some(d) = self.derivatives(o, c, Curvature::Weighted) else { continue };
                 let at = (o.pixel - self.centres[o.view]) / half_long[o.view];
                 for (k, pattern) in patterns(at).into_iter().enumerate() {
                     let column = PATTERNS * o.view + k;
-                    let r = pattern * (by[o.view] * d.w / o.sigma);
+                    let r = pattern * (by[o.view] * d.root / o.sigma);
                     for own in d.by.iter().flatten() {
                         for i in 0..own.size {
                             out[(own.at + i, column)] += own.rows[0][i] * r.x + own.rows[1][i] * r.y;

@@ -1,6 +1,6 @@
 //! Normal equations of bundle adjustment, and the elimination of the points.
 use super::{INTRINSICS, Observation, Problem};
-use crate::numeric::{cauchy_weight, skew};
+use crate::numeric::{cauchy_curvature, cauchy_weight, skew};
 use glam::{DMat3, DVec2, DVec3};
 use nalgebra::{DMatrix, DVector};
 use rayon::prelude::*;
@@ -49,13 +49,67 @@ impl PointBlock {
     }
 }
 
-/// Residual of an observation in standard deviations, its weight, and its derivatives.
+/// Curvature of the robust loss in the normal equations.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Curvature {
+    /// That of the weighted squares: the weights count as constants. For covariances.
+    Weighted,
+    /// That of the loss itself, which bends less along the residual (Triggs et al. 2000, section
+    /// 4.3): steps converge quadratically. At least [`LEAST_CURVATURE`] of the weight remains.
+    Robust,
+}
+
+/// Least curvature along a residual, as a share of that of the weighted squares. Beyond the scale
+/// of the loss it would be negative.
+const LEAST_CURVATURE: f64 = 0.1;
+
+/// Residual of an observation in standard deviations and its derivatives. Both are multiplied by
+/// the root of the weight, so that their products are the normal equations.
 pub(super) struct Derivatives {
     r: DVec2,
-    pub(super) w: f64,
+    /// Root of the weight.
+    pub(super) root: f64,
     pub(super) by_point: [DVec3; 2],
     /// By the pose, unless it is fixed, and by the intrinsics.
     pub(super) by: [Option<JacobianBlock>; 2],
+}
+
+/// Root R = √w (1 − α r̂r̂ᵀ) of the Hessian W of the loss by a residual.
+#[derive(Clone, Copy)]
+pub(super) struct Whitening {
+    r: DVec2,
+    /// √w.
+    pub(super) root: f64,
+    /// α over the squared length of the residual.
+    out: f64,
+    /// 1 − α.
+    along: f64,
+}
+
+/// Root of the Hessian of the loss at residual `r`.
+pub(super) fn whitening(r: DVec2, c: f64, curvature: Curvature) -> Whitening {
+    let r2 = r.length_squared();
+    let along = match curvature {
+        Curvature::Weighted => 1.0,
+        Curvature::Robust => cauchy_curvature(r2, c).max(LEAST_CURVATURE).sqrt(),
+    };
+    Whitening { r, root: cauchy_weight(r2, c).sqrt(), out: (1.0 - along) / r2.max(1e-300), along }
+}
+
+impl Whitening {
+    /// R times the derivatives of both components of the residual.
+    pub(super) fn rows<T>(&self, u: T, v: T) -> (T, T)
+    where
+        T: Copy + std::ops::Mul<f64, Output = T> + std::ops::Add<Output = T> + std::ops::Sub<Output = T>,
+    {
+        let share = (u * self.r.x + v * self.r.y) * self.out;
+        ((u - share * self.r.x) * self.root, (v - share * self.r.y) * self.root)
+    }
+
+    /// R⁻¹ times the gradient of half the loss by the residual.
+    pub(super) fn residual(&self, r: DVec2) -> DVec2 {
+        r * (self.root / self.along)
+    }
 }
 
 /// Derivatives of (u, v) by the parameters `at .. at + size`.
@@ -77,11 +131,11 @@ impl Problem {
     }
 
     /// Normal equations at the current estimate, with the priors.
-    pub(super) fn linearise(&self, c: f64) -> Normal {
+    pub(super) fn linearise(&self, c: f64, curvature: Curvature) -> Normal {
         let (pose_size, n) = self.sizes();
         let of_points: Vec<&[Observation]> = self.observations.chunk_by(|a, b| a.point == b.point).collect();
         let parts: Vec<Normal> =
-            of_points.par_chunks(PART).map(|part| self.linearise_part(part, c)).collect();
+            of_points.par_chunks(PART).map(|part| self.linearise_part(part, c, curvature)).collect();
         let mut normal = Normal { h: DMatrix::zeros(n, n), g: DVector::zeros(n), points: Vec::new() };
         for part in parts {
             normal.h += part.h;
@@ -102,7 +156,7 @@ impl Problem {
     }
 
     /// Normal equations of the observations of some points, without the priors.
-    fn linearise_part(&self, of_points: &[&[Observation]], c: f64) -> Normal {
+    fn linearise_part(&self, of_points: &[&[Observation]], c: f64, curvature: Curvature) -> Normal {
         let (_, n) = self.sizes();
         let points = Vec::with_capacity(of_points.len());
         let mut normal = Normal { h: DMatrix::zeros(n, n), g: DVector::zeros(n), points };
@@ -110,17 +164,19 @@ impl Problem {
             // One coupling per view, and one per camera.
             let coupling = Vec::with_capacity(2 * seen.len());
             let mut block = PointBlock { point: seen[0].point, v: DMat3::ZERO, g: DVec3::ZERO, coupling };
-            for Derivatives { r, w, by_point, by } in seen.iter().filter_map(|o| self.derivatives(o, c)) {
+            for Derivatives { r, by_point, by, .. } in
+                seen.iter().filter_map(|o| self.derivatives(o, c, curvature))
+            {
                 for (j, r) in by_point.iter().zip([r.x, r.y]) {
-                    block.g += *j * (w * r);
-                    block.v += DMat3::from_cols(*j * j.x, *j * j.y, *j * j.z) * w;
+                    block.g += *j * r;
+                    block.v += DMat3::from_cols(*j * j.x, *j * j.y, *j * j.z);
                 }
                 for (column, own) in by.iter().flatten().enumerate() {
                     let coupling = block.coupling_with(own.at, own.size);
                     let [u, v] = own.rows;
                     for k in 0..own.size {
-                        coupling.by[k] += w * (by_point[0] * u[k] + by_point[1] * v[k]);
-                        normal.g[own.at + k] += w * (u[k] * r.x + v[k] * r.y);
+                        coupling.by[k] += by_point[0] * u[k] + by_point[1] * v[k];
+                        normal.g[own.at + k] += u[k] * r.x + v[k] * r.y;
                     }
                     // Poses come before intrinsics, so this fills the lower triangle.
                     for (row, other) in by.iter().flatten().enumerate().skip(column) {
@@ -129,7 +185,7 @@ impl Problem {
                             let at = (own.at + k) * n + other.at;
                             let out = &mut normal.h.as_mut_slice()[at..at + other.size];
                             for i in if row == column { k } else { 0 }..other.size {
-                                out[i] += w * (u[k] * a[i] + v[k] * b[i]);
+                                out[i] += u[k] * a[i] + v[k] * b[i];
                             }
                         }
                     }
@@ -142,7 +198,7 @@ impl Problem {
     }
 
     /// Residual and derivatives of an observation; `None` behind the camera.
-    pub(super) fn derivatives(&self, o: &Observation, c: f64) -> Option<Derivatives> {
+    pub(super) fn derivatives(&self, o: &Observation, c: f64, curvature: Curvature) -> Option<Derivatives> {
         let (t, p) = self.project(o);
         if t.z <= 1e-9 {
             return None;
@@ -179,8 +235,23 @@ impl Problem {
         });
         let own =
             JacobianBlock { at: self.sizes().0 + INTRINSICS * camera, size: INTRINSICS, rows: by_intrinsics };
-        let w = cauchy_weight(r.length_squared(), c);
-        Some(Derivatives { r, w, by_point: rows.map(|row| to_world * row), by: [pose, Some(own)] })
+        let white = whitening(r, c, curvature);
+        let (u, v) = white.rows(rows[0], rows[1]);
+        let by = [pose, Some(own)].map(|block| {
+            block.map(|mut block| {
+                let [u, v] = &mut block.rows;
+                for (u, v) in u.iter_mut().zip(v).take(block.size) {
+                    (*u, *v) = white.rows(*u, *v);
+                }
+                block
+            })
+        });
+        Some(Derivatives {
+            r: white.residual(r),
+            root: white.root,
+            by_point: [to_world * u, to_world * v],
+            by,
+        })
     }
 
     /// Camera system after eliminating the points, with damping λ on every diagonal (lower

@@ -106,6 +106,9 @@ pub(crate) struct Problem {
 pub(crate) struct Adjusted {
     /// Robust cost, in squared standard deviations.
     pub(crate) cost: f64,
+    /// Number of trial steps; tests limit it.
+    #[cfg_attr(not(test), allow(dead_code))]
+    pub(crate) trials: usize,
     /// σ of ln f, k1, k2 and the principal point offset per camera id, from the observations and
     /// the priors; 0 where held.
     pub(crate) sigmas: Vec<[f64; INTRINSICS]>,
@@ -116,7 +119,12 @@ pub(crate) struct Adjusted {
 impl Problem {
     /// Point in the camera frame and its pixel.
     pub(super) fn project(&self, o: &Observation) -> (DVec3, DVec2) {
-        let t = self.poses[o.view].transform(self.points[o.point]);
+        self.project_point(o, self.points[o.point])
+    }
+
+    /// Like [`Self::project`], with the point at `x`.
+    pub(super) fn project_point(&self, o: &Observation, x: DVec3) -> (DVec3, DVec2) {
+        let t = self.poses[o.view].transform(x);
         let (intrinsics, zoom) = (&self.intrinsics[self.camera_ids[o.view]], self.zoom[o.view]);
         let distorted = intrinsics.lens.distort(DVec2::new(t.x, t.y) / t.z);
         let (offset, centre) = (intrinsics.principal_point_offset, self.centres[o.view]);
@@ -145,7 +153,7 @@ impl Problem {
         costs.into_iter().sum::<f64>() + self.prior_cost()
     }
 
-    fn prior_cost(&self) -> f64 {
+    pub(super) fn prior_cost(&self) -> f64 {
         let all = self.intrinsics.iter().zip(&self.priors).flat_map(|(o, p)| p.deviations(o));
         all.filter(|(_, sigma)| *sigma > 0.0).map(|(d, sigma)| (d / sigma).powi(2)).sum()
     }

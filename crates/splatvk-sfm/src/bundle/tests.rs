@@ -1,8 +1,10 @@
 use super::*;
 use crate::math::Random;
 use crate::numeric::rotation_angle;
-use crate::scene::Lens;
+use crate::scene::{Lens, Pose};
+use glam::{DMat2, DVec2, DVec3};
 use nalgebra::DMatrix;
+use normal::whitening;
 
 /// Four cameras on an arc of 60° around 200 points; pixel noise `noise`.
 fn scene(noise: f64) -> (Problem, Problem) {
@@ -60,6 +62,69 @@ fn solve_recovers_truth_despite_outliers() {
     for (a, b) in p.poses.iter().zip(&truth.poses) {
         assert!(rotation_angle(&(a.rotation * b.rotation.transpose())) < 1e-4);
     }
+}
+
+#[test]
+fn solve_takes_few_steps() {
+    let (mut p, _) = scene(1.0);
+    let plain = p.solve(2.0, 60).unwrap();
+    let (mut p, _) = scene(1.0);
+    let mut rng = Random::new(8);
+    for o in p.observations.iter_mut().step_by(7) {
+        o.pixel += DVec2::new(rng.normal(), rng.normal()) * 40.0;
+    }
+    let spoilt = p.solve(2.0, 60).unwrap();
+    println!("{} and {} trials", plain.trials, spoilt.trials);
+    // Steps by the weights alone converge linearly and take dozens.
+    assert!(plain.trials <= 12 && spoilt.trials <= 14, "{} {}", plain.trials, spoilt.trials);
+    let again = p.solve(2.0, 60).unwrap();
+    assert!(again.cost > spoilt.cost * (1.0 - 1e-3), "{} {}", again.cost, spoilt.cost);
+}
+
+#[test]
+fn whitening_squares_to_hessian_of_loss() {
+    let (c, h) = (2.0, 1e-5);
+    for r in [DVec2::new(0.3, -0.4), DVec2::new(1.0, 0.8), DVec2::new(-3.0, 5.0)] {
+        let half = |x: f64, y: f64| 0.5 * crate::numeric::cauchy((r + DVec2::new(x, y)).length_squared(), c);
+        let gradient = DVec2::new(half(h, 0.0) - half(-h, 0.0), half(0.0, h) - half(0.0, -h)) / (2.0 * h);
+        let square = |along: DVec2| half(along.x, along.y) - 2.0 * half(0.0, 0.0) + half(-along.x, -along.y);
+        let across = square(r.perp().normalize() * h * 10.0) / (100.0 * h * h);
+        let along = square(r.normalize() * h * 10.0) / (100.0 * h * h);
+        let weight = 1.0 / (1.0 + r.length_squared() / (c * c));
+        for (curvature, along) in
+            [(Curvature::Weighted, weight), (Curvature::Robust, along.max(0.1 * weight))]
+        {
+            let white = whitening(r, c, curvature);
+            let (u, v) = white.rows(DVec2::X, DVec2::Y);
+            // RᵀR, whose columns are products of the rows.
+            let hessian = DMat2::from_cols(u * u.x + v * v.x, u * u.y + v * v.y);
+            let bend = |d: DVec2| d.dot(hessian * d) / d.length_squared();
+            assert!((bend(r) - along).abs() < 1e-5, "{r} {curvature:?} {} {along}", bend(r));
+            assert!((bend(r.perp()) - across).abs() < 1e-5, "{r} {curvature:?}");
+            let product = u * white.residual(r).x + v * white.residual(r).y;
+            assert!((product - gradient).length() < 1e-8, "{r} {curvature:?} {product} {gradient}");
+        }
+    }
+}
+
+#[test]
+fn relaxed_points_are_at_their_optimum() {
+    let (_, truth) = scene(0.5);
+    let mut p = truth.clone();
+    let mut rng = Random::new(9);
+    p.points.iter_mut().for_each(|x| *x += DVec3::new(rng.normal(), rng.normal(), rng.normal()) * 0.02);
+    let (given, c) = (p.points.clone(), 2.0);
+    let mut cost = p.cost(c);
+    let first = p.relax_points(&given, c, Curvature::Weighted);
+    assert!(first < cost && (first - p.cost(c)).abs() < 1e-9 * cost, "{first} {cost}");
+    for _ in 0..20 {
+        let before = p.points.clone();
+        let next = p.relax_points(&before, c, Curvature::Robust);
+        assert!(next <= cost, "never up");
+        cost = next;
+    }
+    let largest = p.linearise(c, Curvature::Weighted).points.iter().map(|b| b.g.length()).fold(0.0, f64::max);
+    assert!(largest < 1e-3, "{largest}");
 }
 
 #[test]
@@ -158,7 +223,7 @@ fn two_cameras() -> Problem {
 #[test]
 fn gradient_equals_derivative_of_cost() {
     let (p, c, h) = (two_cameras(), 1e3, 1e-6);
-    let normal = p.linearise(c);
+    let normal = p.linearise(c, Curvature::Weighted);
     let cameras = p.sizes().1;
     for k in 0..cameras + 3 * p.points.len() {
         let numeric = (moved(&p, k, h).cost(c) - moved(&p, k, -h).cost(c)) / (2.0 * h);
@@ -200,7 +265,8 @@ fn reduced_step_equals_full_step() {
         whole[(i, i)] *= 1.0 + lambda;
     }
     let step = whole.cholesky().unwrap().solve(&g);
-    let next = p.stepped(&p.linearise(c), lambda).unwrap();
+    let mut next = p.clone();
+    assert!(next.step(&p.linearise(c, Curvature::Weighted), lambda));
     for (k, (a, b)) in p.points.iter().zip(&next.points).enumerate() {
         let want = DVec3::from_slice(&step.as_slice()[cameras + 3 * k..]);
         // Differences of second order and rounding; a missing block shows in the first digit.

@@ -3,7 +3,7 @@
 use super::fit::{IntrinsicsFit, MAX_COST_SHARE, STEPS, fit_intrinsics};
 use super::model::{Model, RefinedIntrinsics};
 use crate::Result;
-use crate::bundle::{Adjusted, IntrinsicsPrior};
+use crate::bundle::IntrinsicsPrior;
 
 /// σ of the principal point offset of a cropped photo, share of its long side: half of the part cut
 /// away.
@@ -100,7 +100,5 @@ pub(super) fn with_crops(best: IntrinsicsFit) -> Result<IntrinsicsFit> {
     if found.bic >= bound || hypothesis.whole.iter().all(|w| *w) || cut.map(off).any(|o| o < OFF_CENTRE) {
         return Ok(best);
     }
-    let of_all = fit_intrinsics(&found.model, RefinedIntrinsics::Full, STEPS)?.outcome;
-    found.outcome = Adjusted { cost: found.outcome.cost, ..of_all };
     Ok(found)
 }

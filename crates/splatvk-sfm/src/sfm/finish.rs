@@ -59,14 +59,13 @@ pub(super) fn finish(
         photos.par_iter().enumerate().map(|(v, p)| undistorted_image(&model, v, &p.image)).collect();
     sub_pixel(&mut model, photos, &undistorted, threshold, progress)?;
     progress.step(4, "optics");
-    let mut outcome = estimate_intrinsics(&mut model)?;
     if refine_on_fine_images(&mut model, photos) {
         progress.check()?;
         reweight_and_adjust(&mut model)?;
         model.prune(0.5 * threshold);
         reweight_and_adjust(&mut model)?;
-        outcome = estimate_intrinsics(&mut model)?;
     }
+    let outcome = estimate_intrinsics(&mut model)?;
     model.normalise();
     let reliability = reliability(&model, &evidence.pairs, threshold);
     sparse_model(photos, &model, outcome, &reliability)

@@ -19,17 +19,16 @@ pub(super) fn adjust_intrinsics(model: &mut Model, refined: RefinedIntrinsics) -
     Ok(found.outcome)
 }
 
-/// Best fit over `choices`, with the standard deviations of the last of them.
+/// Most tracks of a fit that is only compared with others. They have at least twice the
+/// independent observations of [`Model::effective_observations`].
+const COMPARED: usize = 3000;
+
+/// Best fit over `choices`.
 fn best_fit(model: &Model, choices: &[RefinedIntrinsics]) -> Result<IntrinsicsFit> {
     let fit = |refined: &RefinedIntrinsics| fit_intrinsics(model, *refined, STEPS);
     let mut all = choices.par_iter().map(fit).collect::<Vec<_>>().into_iter().collect::<Result<Vec<_>>>()?;
-    let of_all = all.last().map(|e| e.outcome.clone());
     all.sort_by(|a, b| a.bic.total_cmp(&b.bic));
-    let mut best = all.swap_remove(0);
-    if let Some(Adjusted { sigmas, rotation_sigmas, .. }) = of_all {
-        best.outcome = Adjusted { sigmas, rotation_sigmas, ..best.outcome };
-    }
-    Ok(best)
+    Ok(all.swap_remove(0))
 }
 
 /// Merges cameras of photos that may share one, as long as the criterion falls.
@@ -61,6 +60,21 @@ fn merge_cameras(mut best: IntrinsicsFit) -> Result<IntrinsicsFit> {
 /// deviations are those of a fit of all intrinsics, since parameters that the criterion drops may
 /// still be present.
 pub(super) fn estimate_intrinsics(model: &mut Model) -> Result<Adjusted> {
+    let tracks = model.thin(COMPARED);
+    let chosen = select_intrinsics(model)?;
+    *model = Model { tracks, ..chosen };
+    let mut found = fit_intrinsics(model, model.refined, STEPS)?;
+    if model.refined != RefinedIntrinsics::Full {
+        let of_all = fit_intrinsics(&found.model, RefinedIntrinsics::Full, STEPS)?.outcome;
+        found.outcome = Adjusted { cost: found.outcome.cost, ..of_all };
+    }
+    found.widen_sigmas();
+    *model = found.model;
+    Ok(found.outcome)
+}
+
+/// The model with the intrinsics to refine and the camera ids of the best criterion.
+fn select_intrinsics(model: &Model) -> Result<Model> {
     let apart = model.with_separate_intrinsics();
     // Shared cameras are decided only once.
     let merged = model.camera_ids != model.camera_ids_by_file
@@ -83,10 +97,7 @@ pub(super) fn estimate_intrinsics(model: &mut Model) -> Result<Adjusted> {
             found = several;
         }
     }
-    found = crops::with_crops(found)?;
-    found.widen_sigmas();
-    *model = found.model;
-    Ok(found.outcome)
+    Ok(crops::with_crops(found)?.model)
 }
 
 /// Bound of the criterion for several cameras: its value if photos that may share a camera do so

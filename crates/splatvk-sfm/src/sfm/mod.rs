@@ -13,6 +13,7 @@ mod neighbours;
 mod pair;
 mod patch;
 mod refine;
+mod scan;
 mod tracks;
 mod unregistered;
 mod verify;

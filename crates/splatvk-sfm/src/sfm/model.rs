@@ -220,6 +220,13 @@ impl Model {
         }
     }
 
+    /// Keeps at most about `limit` tracks, evenly over their order, and returns all of them.
+    pub(super) fn thin(&mut self, limit: usize) -> Vec<Track> {
+        let every = self.tracks.len().div_ceil(limit).max(1);
+        let few = self.tracks.iter().step_by(every).cloned().collect();
+        std::mem::replace(&mut self.tracks, few)
+    }
+
     /// Clone without tracks.
     pub(super) fn clone_without_tracks(&self) -> Model {
         Model {

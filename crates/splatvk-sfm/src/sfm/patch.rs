@@ -15,7 +15,7 @@ const WINDOW: f64 = 4.0;
 const BLUR: f32 = 0.8;
 /// Standard deviation below which a patch has no texture (1 in 255, twice JPEG noise after the
 /// blur).
-const MIN_CONTRAST: f64 = 0.008;
+pub(super) const MIN_CONTRAST: f64 = 0.008;
 /// Typical relative change of inverse depth per pixel of a surface seen at 45°, f = 650: 1/650. The
 /// slant prior is twice that.
 const SLANT_SIGMA: f64 = 0.003;
@@ -62,35 +62,34 @@ impl LumaGradients {
     }
 
     /// Index of the upper left sample around a position and the bilinear fractions; `None` outside.
-    fn cell(&self, p: DVec2) -> Option<(usize, f32, f32)> {
-        let (u, v) = (p.x - 0.5, p.y - 0.5);
+    fn cell(&self, x: f32, y: f32) -> Option<(usize, f32, f32)> {
+        let (u, v) = (x - 0.5, y - 0.5);
         let (w, h) = self.size();
-        if !(u >= 1.0 && v >= 1.0 && u < (w - 2) as f64 && v < (h - 2) as f64) {
+        if !(u >= 1.0 && v >= 1.0 && u < (w - 2) as f32 && v < (h - 2) as f32) {
             return None;
         }
-        let (i, j) = (u as usize, v as usize);
-        Some((j * w + i, (u - i as f64) as f32, (v - j as f64) as f32))
+        let (i, j) = (u as u32, v as u32);
+        Some((j as usize * w + i as usize, u - i as f32, v - j as f32))
     }
 
-    fn value_at(&self, p: DVec2) -> Option<f64> {
-        let (k, fx, fy) = self.cell(p)?;
-        let (w, d) = (self.value.width, &self.value.data);
-        let top = d[k] + (d[k + 1] - d[k]) * fx;
-        let low = d[k + w] + (d[k + w + 1] - d[k + w]) * fx;
-        Some((top + (low - top) * fy) as f64)
+    /// Value at a position; `None` outside.
+    pub(super) fn value_at(&self, x: f32, y: f32) -> Option<f32> {
+        let (k, fx, fy) = self.cell(x, y)?;
+        Some(mix(&self.value.data, self.value.width, k, fx, fy))
     }
 
     /// (value, gradient) at a position; `None` outside.
     fn sample(&self, p: DVec2) -> Option<(f64, DVec2)> {
-        let (k, fx, fy) = self.cell(p)?;
-        let w = self.value.width;
-        let mix = |d: &[f32]| {
-            let top = d[k] + (d[k + 1] - d[k]) * fx;
-            let low = d[k + w] + (d[k + w + 1] - d[k + w]) * fx;
-            (top + (low - top) * fy) as f64
-        };
-        Some((mix(&self.value.data), DVec2::new(mix(&self.dx), mix(&self.dy))))
+        let (k, fx, fy) = self.cell(p.x as f32, p.y as f32)?;
+        let at = |d: &[f32]| f64::from(mix(d, self.value.width, k, fx, fy));
+        Some((at(&self.value.data), DVec2::new(at(&self.dx), at(&self.dy))))
     }
+}
+
+/// Bilinear value of an image of width `w` between sample `k` and its neighbours.
+fn mix(d: &[f32], w: usize, k: usize, fx: f32, fy: f32) -> f32 {
+    let [a, b] = [k, k + w].map(|k| d[k] + (d[k + 1] - d[k]) * fx);
+    a + (b - a) * fy
 }
 
 /// Offsets and weights of the window, row-major.
@@ -117,11 +116,11 @@ fn standardised(values: &[f64; PIXELS], offsets: &[(DVec2, f64)]) -> Option<([f6
 
 /// Maps a patch of the reference view into another view through a plane of inverse depth `a (1 +
 /// b·d)`.
-struct Warp {
-    m: DMat3,
-    shift: DVec3,
-    f: f64,
-    centre: DVec2,
+pub(super) struct Warp {
+    pub(super) m: DMat3,
+    pub(super) shift: DVec3,
+    pub(super) f: f64,
+    pub(super) centre: DVec2,
 }
 
 impl Warp {
@@ -168,7 +167,8 @@ pub(super) struct Aligned {
 pub(super) struct Aligner<'a> {
     pub(super) model: &'a Model,
     pub(super) images: &'a [LumaGradients],
-    offsets: Vec<(DVec2, f64)>,
+    /// Offsets and weights of a patch, row-major.
+    pub(super) offsets: Vec<(DVec2, f64)>,
     /// From view `i / views` to view `i % views`.
     warps: Vec<Option<Warp>>,
 }
@@ -176,9 +176,9 @@ pub(super) struct Aligner<'a> {
 /// Patch of a facet in its own view.
 pub(super) struct Template {
     /// Standardised values.
-    values: [f64; PIXELS],
+    pub(super) values: [f64; PIXELS],
     /// Viewing rays of the pixels.
-    rays: [DVec3; PIXELS],
+    pub(super) rays: [DVec3; PIXELS],
 }
 
 /// A patch warped into another view.
@@ -208,7 +208,7 @@ impl<'a> Aligner<'a> {
     }
 
     /// Warp between two views; `None` where one is not registered.
-    fn warp(&self, reference: usize, other: usize) -> Option<&Warp> {
+    pub(super) fn warp(&self, reference: usize, other: usize) -> Option<&Warp> {
         self.warps[reference * self.model.poses.len() + other].as_ref()
     }
 
@@ -217,7 +217,8 @@ impl<'a> Aligner<'a> {
     pub(super) fn template(&self, f: &Facet) -> Option<Template> {
         let mut values = [0.0; PIXELS];
         for (value, (d, _)) in values.iter_mut().zip(&self.offsets) {
-            *value = self.images[f.view].value_at(f.pixel + *d)?;
+            let p = f.pixel + *d;
+            *value = f64::from(self.images[f.view].value_at(p.x as f32, p.y as f32)?);
         }
         let (values, _) = standardised(&values, &self.offsets)?;
         let rays = std::array::from_fn(|i| self.model.ray(f.view, f.pixel + self.offsets[i].0));
@@ -231,7 +232,8 @@ impl<'a> Aligner<'a> {
         let mut values = [0.0; PIXELS];
         for ((value, ray), (d, _)) in values.iter_mut().zip(&template.rays).zip(&self.offsets) {
             let p = warp.position(*ray, f.inverse_depth, f.slant, *d)?;
-            *value = self.images[other].value_at(p + shift)?;
+            let p = p + shift;
+            *value = f64::from(self.images[other].value_at(p.x as f32, p.y as f32)?);
         }
         let (sampled, _) = standardised(&values, &self.offsets)?;
         Some(sampled.iter().zip(&template.values).zip(&self.offsets).map(|((a, b), o)| a * b * o.1).sum())
@@ -309,7 +311,9 @@ impl<'a> Aligner<'a> {
                 a.1 -= step;
                 largest = largest.max(step.length());
             }
-            if round >= 3 {
+            // A hundredth of a pixel is below the noise of JPEG.
+            let found = round >= 1 && largest < 0.01;
+            if round >= 3 || found {
                 // Occluded or wrong views would distort the plane of the others.
                 let keep: Vec<bool> = scores.iter().map(|s| *s > 0.5).collect();
                 let mut k = keep.iter();
@@ -318,8 +322,7 @@ impl<'a> Aligner<'a> {
             if active.is_empty() {
                 return None;
             }
-            // A hundredth of a pixel is below the noise of JPEG.
-            if round >= 3 && largest < 0.01 {
+            if found {
                 break;
             }
         }
@@ -360,24 +363,24 @@ impl<'a> Aligner<'a> {
         }
         let index = [0, 1, 2 + 2 * k, 3 + 2 * k];
         let mut correlation = 0.0;
-        // The view's entries in registers.
+        // The view's entries in registers; the lower triangle, which the factorisation reads.
         let mut own_g = index.map(|a| g[a]);
-        let mut own_h = index.map(|a| index.map(|b| h[(a, b)]));
+        let mut own_h = index.map(|a| index.map(|b| h[(b, a)]));
         for (((row, s), t), o) in rows.iter().zip(&warped.values).zip(&template.values).zip(&self.offsets) {
             let j: [f64; 4] = std::array::from_fn(|c| row[c] - mean[c] - along[c] * s);
             correlation += o.1 * s * t;
             for a in 0..4 {
                 let weighted = o.1 * j[a];
                 own_g[a] += weighted * (s - t);
-                for b in 0..4 {
+                for b in a..4 {
                     own_h[a][b] += weighted * j[b];
                 }
             }
         }
         for a in 0..4 {
             g[index[a]] = own_g[a];
-            for b in 0..4 {
-                h[(index[a], index[b])] = own_h[a][b];
+            for b in a..4 {
+                h[(index[b], index[a])] = own_h[a][b];
             }
         }
         correlation

@@ -1,6 +1,7 @@
 //! Sub-pixel refinement of all observations, and further points predicted from the geometry.
 use super::model::{Model, Track, TrackElement};
 use super::patch::{Aligner, Facet, LumaGradients, RADIUS};
+use super::scan::Scan;
 use crate::scene::Image;
 use glam::{DMat3, DVec2, DVec3};
 use rayon::prelude::*;
@@ -228,11 +229,11 @@ fn predict_track(
         })
         .fold(0.0, f64::max);
     let steps = (swing.ceil() as i32).clamp(1, 40);
+    let scans: Vec<Scan> = others.iter().filter_map(|v| Scan::new(aligner, &template, &flat, *v)).collect();
     let mut best: Option<(f64, Facet)> = None;
     for k in -steps..=steps {
         let f = Facet { inverse_depth: rho * (1.0 + SEARCH * k as f64 / steps as f64), ..flat };
-        let mut scores: Vec<f64> =
-            others.iter().filter_map(|v| aligner.ncc(&template, &f, *v, DVec2::ZERO)).collect();
+        let mut scores: Vec<f64> = scans.iter().filter_map(|s| s.ncc(f.inverse_depth)).collect();
         scores.sort_by(|a, b| b.total_cmp(a));
         // The best two views: a third may be occluded.
         scores.truncate(2);

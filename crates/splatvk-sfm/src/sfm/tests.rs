@@ -477,3 +477,37 @@ fn empty_model_focal_from_walls() {
     assert_eq!(prior(Some(300.0), false), (300f64.ln(), EXIF_SIGMA), "EXIF goes before");
     assert_eq!(prior(None, true).1, FOCAL_SIGMA, "a picture of a room on a wall tells nothing");
 }
+
+/// Prints when each step begins.
+struct Clock(std::time::Instant);
+
+impl crate::progress::Progress for Clock {
+    fn begin(&self, _: &'static str, _: u64) {}
+    fn step(&self, done: u64, note: &str) {
+        println!("{:7.2} s  step {done} {note}", self.0.elapsed().as_secs_f64());
+    }
+    fn end(&self) {}
+    fn warn(&self, _: &str) {}
+}
+
+#[test]
+#[ignore = "prints times: SPLATVK_TEST_PHOTOS names a folder of photos"]
+fn stage_times() {
+    let folder = std::env::var("SPLATVK_TEST_PHOTOS").unwrap();
+    let mut files: Vec<_> = std::fs::read_dir(folder).unwrap().map(|f| f.unwrap().path()).collect();
+    files.sort();
+    let photos: Vec<Photo> = files.iter().map(|f| crate::photo::load(f).unwrap()).collect();
+    let features = learned(&photos);
+    let model = reconstruct(&photos, &features, 0, &Clock(std::time::Instant::now())).unwrap();
+    for (camera, fitted) in model.cameras.iter().zip(&model.fitted) {
+        println!(
+            "{} f {:.4} c ({:.3}, {:.3}) {:?} {:?}",
+            camera.name,
+            camera.fx,
+            camera.cx,
+            camera.cy,
+            camera.pose.centre(),
+            fitted
+        );
+    }
+}
