@@ -17,9 +17,16 @@ const SIZE: usize = 160;
 /// Most work of a stage: steps, submissions, reads, and KiB read and written.
 type Limit = (&'static str, [u64; 5]);
 
-/// The work of a run on four photos of 160 × 120 pixels with known cameras, at the preset draft. A
-/// change that lowers a count by a tenth lowers it here, too.
-const LIMITS: [Limit; 1] = [("splats", [0; 5])];
+/// The work of a run on four photos of 160 × 120 pixels with known cameras, at the preset draft,
+/// with some room: a tile list that overflows repeats a step. A change that saves a fifth of a count
+/// lowers it here, too.
+const LIMITS: [Limit; 5] = [
+    ("dense stereo", [550, 62, 1, 1250, 1850]),
+    ("splats", [200, 255, 530, 15_000, 8200]),
+    ("language", [0, 22, 57, 25_600, 2750]),
+    ("decode", [4, 17, 39, 3000, 10_800]),
+    ("seen", [4, 8, 9, 8900, 4300]),
+];
 
 /// Progress that notes the work of the device at the beginning of every stage.
 struct Counter {
@@ -58,7 +65,8 @@ fn photos() -> (Vec<Photo>, Extras) {
 
 /// Work of each stage of a run, by shaders alone, as on a GPU.
 fn counted() -> Vec<(&'static str, [u64; 5])> {
-    let disabled = ["native passes", "plane sweep on the host"].map(str::to_owned).into();
+    let disabled =
+        ["native passes", "plane sweep on the host", "text queries on the host"].map(str::to_owned).into();
     let device = TestDevice::open(&Options { disabled, ..gpu::options(None) }).unwrap();
     let counter = Counter { device: (*device).clone(), stages: Mutex::default() };
     let (photos, extras) = photos();
@@ -88,7 +96,7 @@ fn counted_work_does_not_grow() {
             ["steps", "submissions", "reads", "KiB read", "KiB written"].into_iter().zip(limits).zip(total)
         {
             assert!(total <= limit, "{stage}: {total} {name}, at most {limit} so far");
-            assert!(10 * total >= 9 * limit, "{stage}: {total} {name}: lower the limit of {limit}");
+            assert!(5 * total >= 4 * limit, "{stage}: {total} {name}: lower the limit of {limit}");
         }
     }
 }

@@ -155,6 +155,7 @@ impl Reconstruction<'_> {
         remaining.plan(&Work {
             on_cpu: device.info().is_cpu,
             photos: photos.len(),
+            fine: photos.iter().filter(|p| p.fine.is_some()).count(),
             pixels: photos.iter().map(|p| p.image.width * p.image.height).sum(),
             steps: training.iterations,
             language: config.language.is_some(),

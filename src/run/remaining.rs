@@ -33,6 +33,8 @@ pub(super) struct Work {
     pub(super) on_cpu: bool,
     /// Number of photos.
     pub(super) photos: usize,
+    /// Number of photos that are larger than their working size.
+    pub(super) fine: usize,
     /// Working pixels of all photos.
     pub(super) pixels: usize,
     /// Training steps.
@@ -53,19 +55,19 @@ fn parts(work: &Work) -> Vec<Part> {
     let list = [
         ("photos", 0.1, 0.1, photos),
         ("features", 0.3, 0.1, photos),
-        // Pairs of photos.
-        ("cameras", 6.0, 2.5, photos * photos),
-        ("dense stereo", 26.0, 0.3, pixels),
-        ("surfaces", 3.0, 1.1, pixels),
-        ("initial splats", 1.5, 0.4, pixels),
-        ("splats", 60.0, 0.3, steps),
+        // Each photo is adjusted with those before it; positions are found again on fine photos.
+        ("cameras", 3.0, 2.5, photos.powf(1.5) + 2.0 * work.fine as f64 / TYPICAL_PHOTOS),
+        ("dense stereo", 14.0, 0.3, pixels),
+        ("surfaces", 2.6, 1.1, pixels),
+        ("initial splats", 2.0, 0.4, pixels),
+        ("splats", 19.0, 0.3, steps),
         // Half of the time on photos of shiny things; matt ones skip it.
-        ("view dependence", 6.0, 0.2, pixels * view_dependence),
-        ("language", 2.0, 0.4, pixels),
-        ("decode", 5.0, 0.3, pixels),
-        ("query", 0.5, 0.2, 1.0),
-        ("seen", 1.0, 0.1, pixels),
-        ("write", 1.5, 0.3, pixels),
+        ("view dependence", 1.0, 0.2, pixels * view_dependence),
+        ("language", 0.7, 0.4, pixels),
+        ("decode", 0.7, 0.3, pixels),
+        ("query", 0.1, 0.2, 1.0),
+        ("seen", 0.3, 0.1, pixels),
+        ("write", 0.6, 0.3, pixels),
     ];
     let of_language = |stage: &str| ["language", "decode", "query"].contains(&stage);
     list.into_iter()
@@ -214,7 +216,8 @@ mod tests {
     use super::*;
 
     fn work() -> Work {
-        Work { on_cpu: true, photos: 4, pixels: 4 * 640 * 480, steps: 200, language: true, built_in: true }
+        let pixels = 4 * 640 * 480;
+        Work { on_cpu: true, photos: 4, fine: 0, pixels, steps: 200, language: true, built_in: true }
     }
 
     fn course(work: &Work) -> Course {
@@ -224,78 +227,76 @@ mod tests {
     /// A stage: begin, seconds, and finished (share of the steps, seconds).
     type Measured = (&'static str, f64, f64, &'static [(f64, f64)]);
 
-    /// Stages of the first lane of two runs of breakfast, on a busy machine and on one that was
-    /// busy only while it trained.
-    const RUNS: [(f64, [Measured; 10]); 2] = [
+    /// Stages of the first lane of runs on two quiet cores: breakfast, and four photos of 12
+    /// megapixels at 600 × 800.
+    const RUNS: [(f64, [usize; 2], &[Measured]); 2] = [
         (
-            369.0,
-            [
-                ("photos", 0.1, 0.1, &[]),
-                ("cameras", 0.8, 10.4, &[]),
-                (
-                    "dense stereo",
-                    11.4,
-                    100.7,
-                    &[(0.02, 13.7), (0.12, 26.6), (0.33, 44.7), (0.52, 60.7), (0.998, 100.7)],
-                ),
-                ("surfaces", 112.2, 4.0, &[]),
-                ("initial splats", 116.1, 2.0, &[]),
-                (
-                    "splats",
-                    118.2,
-                    221.0,
-                    &[(0.05, 11.6), (0.25, 48.2), (0.5, 94.1), (0.65, 125.6), (0.75, 152.5), (0.9, 192.6)],
-                ),
-                ("language", 339.2, 16.4, &[]),
-                ("decode", 355.6, 9.5, &[]),
-                ("seen", 365.7, 1.6, &[]),
-                ("write", 367.3, 1.7, &[]),
+            44.8,
+            [0, 4 * 640 * 480],
+            &[
+                ("photos", 0.8, 0.0, &[]),
+                ("features", 1.0, 0.1, &[]),
+                ("cameras", 1.1, 3.0, &[]),
+                ("dense stereo", 4.2, 14.1, &[(0.12, 2.8), (0.33, 6.4), (0.62, 10.3), (0.998, 14.1)]),
+                ("surfaces", 18.3, 2.6, &[]),
+                ("initial splats", 20.9, 2.2, &[]),
+                ("splats", 23.1, 19.1, &[(0.02, 0.7), (0.12, 2.4), (0.33, 6.3), (0.52, 9.9), (0.95, 17.8)]),
+                ("language", 42.2, 0.7, &[]),
+                ("decode", 43.0, 0.7, &[]),
+                ("query", 43.7, 0.1, &[]),
+                ("seen", 43.8, 0.3, &[]),
+                ("write", 44.1, 0.6, &[]),
             ],
         ),
         (
-            264.7,
-            [
-                ("photos", 0.1, 0.1, &[]),
-                ("cameras", 1.0, 10.0, &[]),
-                (
-                    "dense stereo",
-                    11.2,
-                    52.8,
-                    &[(0.02, 8.5), (0.12, 15.9), (0.33, 24.7), (0.52, 32.7), (0.998, 52.8)],
-                ),
-                ("surfaces", 64.1, 2.1, &[]),
-                ("initial splats", 66.3, 1.1, &[]),
-                ("splats", 67.3, 182.0, &[(0.25, 27.5), (0.365, 46.3), (0.495, 73.5), (0.8, 140.1)]),
-                ("language", 248.0, 8.7, &[]),
-                ("decode", 256.7, 4.8, &[]),
-                ("seen", 262.7, 0.9, &[]),
-                ("write", 263.8, 0.9, &[]),
+            74.7,
+            [4, 4 * 600 * 800],
+            &[
+                ("photos", 0.1, 1.8, &[]),
+                ("features", 2.1, 0.2, &[]),
+                ("cameras", 2.3, 9.4, &[]),
+                ("dense stereo", 12.0, 20.8, &[(0.12, 4.4), (0.33, 9.9), (0.62, 15.2), (0.998, 20.8)]),
+                ("surfaces", 32.8, 4.5, &[]),
+                ("initial splats", 37.3, 2.4, &[]),
+                ("splats", 39.6, 27.8, &[(0.02, 1.6), (0.12, 5.7), (0.33, 11.3), (0.52, 16.1), (0.95, 26.1)]),
+                ("view dependence", 67.5, 3.1, &[]),
+                ("language", 70.6, 1.4, &[]),
+                ("decode", 72.0, 1.1, &[]),
+                ("query", 73.1, 0.2, &[]),
+                ("seen", 73.2, 0.4, &[]),
+                ("write", 73.7, 0.9, &[]),
             ],
         ),
     ];
 
+    /// From half-way on the estimate is right within a third, and two seconds: whether there is a
+    /// view-dependence stage is not known before.
     #[test]
     fn estimate_follows_measured_runs() {
-        for (total, stages) in RUNS {
-            let mut course = course(&work());
+        // Another machine, of another pace, has the same estimates.
+        for (pace, (total, [fine, pixels], stages)) in
+            [1.0, 4.0].into_iter().flat_map(|p| RUNS.map(|r| (p, r)))
+        {
+            let total = pace * total;
+            let mut course = course(&Work { fine, pixels, ..work() });
             let mut checked = 0;
             for (stage, from, seconds, shares) in stages {
+                let from = pace * from;
                 course.begin(stage, from);
                 assert_eq!(course.overall(from).unwrap().stages, 13);
-                for (steps, after) in shares {
+                for (steps, after) in *shares {
                     course.step((1000.0 * steps) as u64, 1000);
-                    let now = from + after;
+                    let now = from + pace * after;
                     let (left, truth) = (course.overall(now).unwrap().seconds_left.unwrap(), total - now);
-                    println!("{stage} {steps} at {now:.0} s: {left:.0} s left, in truth {truth:.0}");
-                    // After the first half minute, and where the machine keeps its pace.
-                    if now > 30.0 {
-                        assert!((left - truth).abs() < 0.35 * truth + 15.0, "{left:.0}, {truth:.0}");
+                    println!("{stage} {steps} at {now:.0} s: {left:.1} s left, in truth {truth:.1}");
+                    if now > 0.5 * total {
+                        assert!((left - truth).abs() < truth / 3.0 + 2.0, "{left:.0}, {truth:.0}");
                         checked += 1;
                     }
                 }
-                course.end(from + seconds);
+                course.end(from + pace * seconds);
             }
-            assert!(checked > 5);
+            assert!(checked >= 4);
             assert!(course.overall(total).unwrap().seconds_left.unwrap() < 1.0, "all is done");
         }
     }
