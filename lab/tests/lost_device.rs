@@ -38,7 +38,7 @@ fn scene() -> (Vec<Photo>, Geometry) {
                 points.positions.push(camera.unproject(pixel, f64::from(z)).as_vec3().to_array());
                 points.colours.push(seen.image.data[y * 96 + x]);
                 points.confidence.push(1.0);
-                points.view.push(view as u8);
+                points.view.push(view as u32);
                 points.radius.push(z / camera.fx as f32);
             }
         }
