@@ -112,12 +112,13 @@ impl RgbOptions {
         }
     }
 
-    /// These options for a number of photos. Of more than [`MANY_PHOTOS`], each is used as often,
-    /// and adds as many splats, as of that many.
+    /// These options for a number of photos. Of more than [`MANY_PHOTOS`], each is used as often as
+    /// of that many; splats grow with the square root, since many photos overlap.
     pub fn for_photos(self, photos: usize) -> Self {
-        let grown = |n: usize| n.max(n * photos / MANY_PHOTOS);
-        let mut options = self.clone().with_iterations(grown(self.iterations));
-        options.init.max_points = grown(options.init.max_points);
+        let growth = (photos as f64 / MANY_PHOTOS as f64).max(1.0);
+        let steps = (self.iterations as f64 * growth) as usize;
+        let mut options = self.with_iterations(steps);
+        options.init.max_points = (options.init.max_points as f64 * growth.sqrt()) as usize;
         options.most_unseen = UNSEEN_PER_PHOTO * photos.min(MANY_PHOTOS / 2);
         options
     }
@@ -335,7 +336,7 @@ mod tests {
         let many = few.clone().for_photos(100);
         assert_eq!(many.iterations, few.iterations * 100 / MANY_PHOTOS);
         assert_eq!(many.rates.means.steps, many.iterations, "the schedule ends with the run");
-        assert_eq!(many.init.max_points, few.init.max_points * 100 / MANY_PHOTOS);
+        assert_eq!(many.init.max_points, few.init.max_points * 10 / 4, "the root of 100 / 16");
         // Continued surfaces leave most of a small device to the surfaces that photos show.
         let mut limited = many;
         limited.limit_splats(120_000);
