@@ -6,7 +6,7 @@
 #extension GL_GOOGLE_include_directive : require
 #extension GL_EXT_control_flow_attributes : require
 layout(local_size_x = 128) in;
-// As in query_columns.comp.
+// Codes and tables of query_columns.comp.
 layout(std430, binding = 0) readonly buffer Codes { uint codes[]; };
 layout(std430, binding = 1) readonly buffer Tables { uint tables[]; };
 layout(std430, binding = 2) readonly buffer Columns { uint columns[]; };

@@ -41,7 +41,8 @@ pub(super) struct LogFocal {
 const MAX_PHOTOS: usize = 8;
 
 /// Estimates ln (f / long side) of photos of one camera, from those with a σ up to [`SHARP`];
-/// `None` without any. Of many photos some are used, in even steps. `prior` is on the same quantity; the result includes it.
+/// `None` without any. Of many photos some are used, in even steps. `prior` is on the same
+/// quantity; the result includes it.
 pub(super) fn log_focal<'a>(images: impl Iterator<Item = &'a RgbImage>, prior: LogFocal) -> Option<LogFocal> {
     let all: Vec<&RgbImage> = images.collect();
     let count = all.len().min(MAX_PHOTOS);
