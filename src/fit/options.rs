@@ -112,8 +112,8 @@ impl RgbOptions {
         }
     }
 
-    /// These options for a number of photos. Of more than [`MANY_PHOTOS`], each is used as often as
-    /// of that many; splats grow with the square root, since many photos overlap.
+    /// These options for a number of photos. Of more than 16, each is used as often as of
+    /// 16; splats grow with the square root, since many photos overlap.
     pub fn for_photos(self, photos: usize) -> Self {
         let growth = (photos as f64 / MANY_PHOTOS as f64).max(1.0);
         let steps = (self.iterations as f64 * growth) as usize;

@@ -297,44 +297,4 @@ mod tests {
         recorded.stop();
         assert!(second.check().is_err() && recorded.check().is_err());
     }
-
-    /// Collects the fields of every event.
-    struct Collector(Mutex<Vec<String>>);
-
-    impl tracing::Subscriber for Collector {
-        fn enabled(&self, metadata: &tracing::Metadata<'_>) -> bool {
-            metadata.target() == TARGET
-        }
-        fn new_span(&self, _: &tracing::span::Attributes<'_>) -> tracing::span::Id {
-            tracing::span::Id::from_u64(1)
-        }
-        fn record(&self, _: &tracing::span::Id, _: &tracing::span::Record<'_>) {}
-        fn record_follows_from(&self, _: &tracing::span::Id, _: &tracing::span::Id) {}
-        fn event(&self, event: &tracing::Event<'_>) {
-            let mut text = event.metadata().level().to_string();
-            event.record(&mut |field: &tracing::field::Field, value: &dyn std::fmt::Debug| {
-                text += &format!(" {field}={value:?}");
-            });
-            lock(&self.0).push(text);
-        }
-        fn enter(&self, _: &tracing::span::Id) {}
-        fn exit(&self, _: &tracing::span::Id) {}
-    }
-
-    #[test]
-    fn recorded_emits_tracing_events() {
-        let collector = std::sync::Arc::new(Collector(Mutex::default()));
-        tracing::subscriber::with_default(collector.clone(), || {
-            let recorded = Recorded::new(&Silent);
-            recorded.begin("splats", 2);
-            recorded.figures(1, &[("psnr", 20.0)]);
-            recorded.warn("few matches");
-            recorded.end();
-        });
-        let events = lock(&collector.0).clone();
-        assert_eq!(events[0], r#"INFO message=begin stage="splats""#);
-        assert_eq!(events[1], r#"DEBUG step=1 figures=[("psnr", 20.0)]"#);
-        assert_eq!(events[2], "WARN message=few matches");
-        assert!(events[3].starts_with(r#"INFO message=end stage="splats" seconds="#), "{events:?}");
-    }
 }
