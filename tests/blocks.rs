@@ -4,9 +4,10 @@
 mod support;
 use glam::DVec3;
 use splatvk::fit::{self, LanguageOptions, Preset, RgbOptions};
-use splatvk::gpu::{self, Device, Options, TestDevice, test_device};
+use splatvk::gpu::{self, Device, Options, Recorder, TestDevice, test_device};
 use splatvk::pass::GradientReduction;
-use splatvk::pass::{RenderedFrame, Renderer};
+use splatvk::pass::bands::Band;
+use splatvk::pass::{FrameBuffers, Rasterizer, RenderedFrame, Renderer, SplatBuffers};
 use splatvk::progress::Silent;
 use splatvk::query::{QueryOptions, TextQuery, answer};
 use splatvk::run::view::Viewer;
@@ -71,6 +72,74 @@ fn bands_equal_whole_frame() {
             assert_alike(&atomics, &gradients, &format!("{mib} MiB {summation:?}"));
         }
     }
+}
+
+/// A rasterizer for two sizes has the results of one for each, whichever image came before.
+#[test]
+fn sizes_share_a_rasterizer() {
+    let (splats, camera) = seeded::benchmark(3000, 200, 96, 1, 3);
+    let portrait = Camera { width: 96, height: 200, cx: camera.cy, cy: camera.cx, ..camera.clone() };
+    let scenes = [&camera, &portrait].map(|camera| Scene::new(splats.clone(), camera, 5, 3));
+    for limit in [None, Some(1 << 19)] {
+        let options = Options { max_binding: limit, deterministic: true, ..gpu::options(None) };
+        let device = TestDevice::open(&options).unwrap();
+        let (params, _) = scenes[0].upload(&device);
+        let sizes = scenes.each_ref().map(|scene| scene.view.size);
+        let mut shared = Rasterizer::for_sizes(&device, splats.len(), 5, &sizes).unwrap();
+        assert!(shared.set_size([300, 200]).is_err());
+        for scene in [&scenes[1], &scenes[0], &scenes[1]] {
+            shared.set_size(scene.view.size).unwrap();
+            shared.set_view(&scene.view).unwrap();
+            let [width, height] = scene.view.size;
+            let mut own = Rasterizer::new(&device, splats.len(), 5, width, height).unwrap();
+            own.set_view(&scene.view).unwrap();
+            let upstream = scene.upstream(5);
+            let [a, b] =
+                [&mut shared, &mut own].map(|raster| stepped(&device, raster, &params, scene, &upstream));
+            assert!(a.0 == b.0, "{width} × {height}, at most {limit:?} bytes");
+            // Lists that another size has grown divide the image into other strips, so that the
+            // sums may have another order.
+            for (a, b) in a.1.iter().zip(&b.1) {
+                let off = difference(a, b);
+                assert!(off < if limit.is_some() { 2e-5 } else { 1e-12 }, "{width} × {height}: {off}");
+            }
+        }
+    }
+}
+
+/// Planes of all bands, and gradients.
+fn stepped(
+    device: &Device,
+    raster: &mut Rasterizer,
+    params: &SplatBuffers,
+    scene: &Scene,
+    upstream: &[f32],
+) -> (Vec<Vec<f32>>, Vec<Vec<f32>>) {
+    let mut planes = Vec::new();
+    let gradients = params.zeros_like(device).unwrap();
+    let bands: Vec<_> = raster.frame().bands.iter().collect();
+    let read = |frame: &FrameBuffers, _: &Band| {
+        planes.push(frame.planes.read_range(0..9 * frame.pixels() as usize)?);
+        Ok(())
+    };
+    raster.forward_bands(params, &scene.options, read).unwrap();
+    for band in &bands {
+        let frame = raster.frame();
+        let part = frame.bands.cut_inner(band, upstream, 0.0);
+        frame.planes_grad.write_at(0, &part).unwrap();
+        let mut rec = Recorder::new(device, "step");
+        if band.index == 0 {
+            raster.record_projection(&mut rec, params, &scene.options);
+        }
+        raster.record_band(&mut rec, params, band);
+        raster.record_band_backward(&mut rec, params, &scene.options, band);
+        if band.index + 1 == bands.len() {
+            raster.record_gradients(&mut rec, params, &scene.options, &gradients);
+        }
+        rec.run().unwrap();
+    }
+    let (splats, features) = gradients.download().unwrap();
+    (planes, parameters(&splats).into_iter().chain([features]).collect())
 }
 
 /// Code gradients of all features at once would be 205.7 MiB for this many splats, whatever the

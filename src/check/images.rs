@@ -35,15 +35,16 @@ pub(super) fn ssim_l1(device: &Device, rows: SsimRowKernel) -> Found {
     let x = noise(3 * PIXELS, 21);
     let y: Vec<f32> = noise(3 * PIXELS, 22).iter().zip(&x).map(|(n, x)| 0.7 * x + 0.3 * n).collect();
     let bands = Bands::whole(SIZE.0, SIZE.1);
-    let pass = SsimL1::with(device, &bands, rows)?;
+    let pass = SsimL1::with(device, std::slice::from_ref(&bands), rows)?;
     let (rendered, target) = (device.buffer_from("rendered", &x)?, device.buffer_from("target", &y)?);
     let gradient = device.buffer::<f32>("gradient", 3 * PIXELS)?;
     let sums = device.buffer::<f32>("loss", 2)?;
     let mut rec = Recorder::new(device, "self-check of the image loss");
-    pass.record(&mut rec, &bands.get(0), &rendered, &target, &gradient, None, [0.8, 0.2], (&sums, 0));
+    let band = (&bands, &bands.get(0));
+    pass.record(&mut rec, band, &rendered, &target, &gradient, None, [0.8, 0.2], (&sums, 0));
     rec.run()?;
     let sums = sums.read()?;
-    let loss = pass.loss([sums[0], sums[1]].map(f64::from), None);
+    let loss = ssim_l1::ImageLoss::of(&bands, [sums[0], sums[1]].map(f64::from), None);
     let (reference, by_pixel) = ssim_l1::ssim_l1(&wide(&x), &wide(&y), SIZE.0, SIZE.1, 0.8, 0.2);
     let largest = by_pixel.iter().fold(0.0f64, |m, g| m.max(g.abs()));
     // E[x²] − E[x]² cancels about three digits in f32, and 1/C2 amplifies the rest in flat regions.

@@ -9,8 +9,8 @@ use super::photos::Photos;
 use super::scale::SceneScale;
 use super::schedule::ViewOrder;
 use super::training::{self, StepReport, Trainer, Training};
-use super::views::Views;
-use crate::gpu::{self, Buffer, Device, Recorder};
+use super::views::{Views, slot};
+use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::channels::BASE_CHANNELS;
 use crate::pass::options::{FeatureMode, RasterOptions};
 use crate::pass::{codes, regularise, sum};
@@ -178,7 +178,8 @@ pub(crate) struct Run<'a> {
     width: usize,
     extent: f64,
     targets: CodeTargets,
-    losses: Vec<Buffer<f32>>,
+    /// Language loss per pixel of a band.
+    loss: Buffer<f32>,
     partials: Buffer<f32>,
     /// Reliability per level, [N].
     reliability: Vec<Vec<f32>>,
@@ -210,7 +211,7 @@ impl<'a> Run<'a> {
         let scale = SceneScale::measure(cameras, &splats.means);
         let model = Model::new(device, splats, channels)?;
         let (capacity, near) = (splats.len(), scale.near());
-        let views = Views::new(device, photos, (&options.losses, 0.0), capacity, channels, near)?;
+        let views = Views::new(device, &[(photos, &options.losses)], 0.0, capacity, channels, near)?;
         let targets = CodeTargets::new(device, &fields, images, &views, 1.0 - options.image_weight)?;
         let raster = RasterOptions {
             sh_degree: splats.sh_degree,
@@ -223,11 +224,7 @@ impl<'a> Run<'a> {
             Start::Zero => {}
             Start::Lifted => model.values.features.write(&lifted.features(width))?,
         }
-        let losses = views
-            .stages
-            .iter()
-            .map(|s| device.buffer::<f32>("language loss", s.raster.frame().bands.pixels()))
-            .collect::<gpu::Result<_>>()?;
+        let loss = device.buffer::<f32>("language loss", views.most_pixels())?;
         let order = ViewOrder::new(cameras.len(), 0, options.seed);
         Ok(Run {
             trainer: Trainer::new(device, raster, model, views, cameras.to_vec(), order),
@@ -236,7 +233,7 @@ impl<'a> Run<'a> {
             width,
             extent: scale.extent,
             targets,
-            losses,
+            loss,
             partials: device.buffer::<f32>("loss partials", sum::PARTIALS)?,
             reliability,
             recent: Vec::new(),
@@ -258,7 +255,7 @@ impl<'a> Run<'a> {
         let (t, levels, width) = (&mut self.trainer, &self.levels, self.width);
         for (view, camera) in t.cameras.iter().enumerate() {
             t.views.set_camera(view, camera)?;
-            let raster = &mut t.views.stage_mut(view).raster;
+            let raster = &mut t.views.raster;
             raster.forward_bands(&t.model.values, &t.raster, |frame, band| {
                 let pixels = frame.bands.pixels();
                 for (l, (_, level)) in levels.iter().enumerate() {
@@ -321,21 +318,24 @@ impl Training for Run<'_> {
 
     fn record(&self, view: usize) -> Recorder {
         let Trainer { device, raster, model, views, .. } = &self.trainer;
-        let (item, stage) = (&views.list[view], views.stage(view));
-        let frame = stage.raster.frame();
+        let (item, rasterizer) = (&views.list[view], &views.raster);
+        let frame = rasterizer.frame();
         let mut rec = Recorder::new(device, "language step");
-        stage.raster.record_projection(&mut rec, &model.values, raster);
+        if views.have_several_sizes() {
+            // Not every plane of gradients is written.
+            rec.fill(&frame.planes_grad, 0);
+        }
+        rasterizer.record_projection(&mut rec, &model.values, raster);
         let Losses { l1, dssim, .. } = self.options.losses;
         let weights = [l1, dssim].map(|w| w * self.options.image_weight);
-        let loss = &self.losses[item.stage];
-        for band in frame.bands.iter() {
-            stage.raster.record_band(&mut rec, &model.values, &band);
+        for band in item.bands.iter() {
+            rasterizer.record_band(&mut rec, &model.values, &band);
             if !self.options.detach_geometry {
-                let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(&band)));
+                let (target, sums) = (&item.target[band.index], (&views.sums, slot(&band)));
                 let gradient = &frame.planes_grad;
-                stage.loss.record(
+                views.loss.record(
                     &mut rec,
-                    &band,
+                    (&item.bands, &band),
                     &frame.planes,
                     target,
                     gradient,
@@ -349,21 +349,22 @@ impl Training for Run<'_> {
                     regularise::record_alpha(&mut rec, frame, &alpha[band.index], weight);
                 }
             }
-            codes::record(&mut rec, &self.targets.of(view, &band), frame, loss);
-            sum::record(&mut rec, loss, &self.partials, &stage.sums, stage.slot(&band) + LANGUAGE_SUM);
-            stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
+            codes::record(&mut rec, &self.targets.of(view, &band), frame, &self.loss);
+            let (loss, sums) = ((&self.loss, item.bands.pixels()), (&views.sums, slot(&band) + LANGUAGE_SUM));
+            sum::record(&mut rec, loss, &self.partials, sums);
+            rasterizer.record_band_backward(&mut rec, &model.values, raster, &band);
         }
         if !self.options.detach_geometry {
-            model.record_update(&mut rec, &stage.raster, raster, None);
+            model.record_update(&mut rec, rasterizer, raster, None);
         }
-        model.record_feature_update(&mut rec, &stage.raster, raster);
+        model.record_feature_update(&mut rec, rasterizer, raster);
         rec.download(&frame.status);
-        rec.download(&stage.sums);
+        rec.download(&views.sums);
         rec
     }
 
     fn read_back(&mut self, view: usize, _: usize) -> Result<()> {
-        self.recent.push(self.trainer.views.stage(view).total()?[LANGUAGE_SUM as usize]);
+        self.recent.push(self.trainer.views.total(view)?[LANGUAGE_SUM as usize]);
         Ok(())
     }
 

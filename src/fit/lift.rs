@@ -54,7 +54,7 @@ impl CodeTargets {
                 scale.push((weight / (levels.len() * valid * width) as f64) as f32);
                 first += level.codebook.len() as i32;
             }
-            let bands = &views.stage(view).raster.frame().bands;
+            let bands = &views.list[view].bands;
             let band = |b| device.buffer_from("code labels", &bands.cut_inner(&b, &rows, -1));
             labels.push(bands.iter().map(band).collect::<gpu::Result<_>>()?);
             weights.push(device.buffer_from("code weights", &scale)?);
@@ -126,19 +126,14 @@ pub(super) fn lift(
     let near = SceneScale::measure(cameras, &splats.means).near();
     // Colours are not rendered.
     let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
-    let mut rasterizers: Vec<Rasterizer> = Vec::new();
+    let sizes: Vec<[u32; 2]> = cameras.iter().map(|c| [c.width, c.height]).collect();
+    let mut raster = Rasterizer::for_sizes(device, splats.len(), 0, &sizes)?;
     let mut weights = LabelWeights::new(splats.len());
     for (view, camera) in cameras.iter().enumerate() {
         progress.check()?;
-        let (width, height) = (camera.width, camera.height);
-        let known = rasterizers.iter().position(|r| [r.frame().width, r.frame().height] == [width, height]);
-        let index = known.unwrap_or(rasterizers.len());
-        if index == rasterizers.len() {
-            rasterizers.push(Rasterizer::new(device, splats.len(), 0, width, height)?);
-        }
-        let raster = &mut rasterizers[index];
+        raster.set_size(sizes[view])?;
         raster.set_view(&View::new(camera, near))?;
-        let labels = labels_of_view(levels, view, (width * height) as usize)?;
+        let labels = labels_of_view(levels, view, camera.width as usize * camera.height as usize)?;
         raster.add_label_weights(&params, &options, &labels, &mut weights)?;
     }
     Ok(Lifted::new(&weights, splats.len(), levels))

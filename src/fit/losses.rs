@@ -1,6 +1,6 @@
 //! Terms of the objective of the colour stage. A stage states the terms that it uses; a term that
 //! it does not name is off.
-use super::views::{SizeBuffers, TrainView};
+use super::views::{TrainView, Views, slot};
 use crate::gpu::Recorder;
 use crate::pass::bands::Band;
 use crate::pass::regularise::{self, RatioPenalty};
@@ -56,18 +56,13 @@ impl Losses {
     }
 
     /// Records the gradients by the rendered planes of a band.
-    pub(super) fn record_image(
-        &self,
-        rec: &mut Recorder,
-        stage: &SizeBuffers,
-        item: &TrainView,
-        band: &Band,
-    ) {
-        let frame = stage.raster.frame();
-        let (target, sums) = (&item.target[band.index], (&stage.sums, stage.slot(band)));
+    pub(super) fn record_image(&self, rec: &mut Recorder, views: &Views, item: &TrainView, band: &Band) {
+        let frame = views.raster.frame();
+        let (target, sums) = (&item.target[band.index], (&views.sums, slot(band)));
         let (planes, gradient, weights) = (&frame.planes, &frame.planes_grad, [self.l1, self.dssim]);
-        stage.loss.record(rec, band, planes, target, gradient, item.covered, weights, sums);
-        // A view without depth clears the gradients of another view of its size.
+        let bands = (&item.bands, band);
+        views.loss.record(rec, bands, planes, target, gradient, item.covered, weights, sums);
+        // A view without depth clears the gradients of another view.
         let (reference, weight) = match (&self.depth, &item.depth) {
             (Some(weight), Some((references, count))) => {
                 (Some(&references[band.index]), weight / *count as f64)

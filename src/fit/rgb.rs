@@ -18,6 +18,7 @@ use crate::gpu::{Device, Recorder};
 use crate::pass::compact;
 use crate::pass::metrics::psnr_masked;
 use crate::pass::options::{FeatureMode, RasterOptions};
+use crate::pass::ssim_l1::ImageLoss;
 use crate::progress::Progress;
 use crate::scene::{Camera, Coverage, DepthMap, Outside, PointCloud, RgbImage, Splats};
 use crate::{Error, Result};
@@ -257,14 +258,13 @@ impl<'a> Run<'a> {
             feature_mode: FeatureMode::Linear,
             features_move_geometry: true,
         };
-        let losses = (&options.losses, options.min_confidence);
-        let mut views = Views::new(device, photos, losses, start.len(), 0, scale.near())?;
         let (count, confidence) = (options.virtual_views, options.min_confidence);
         let virtual_views = virtual_views(&photos, count, confidence, options.seed);
+        let mut groups = vec![(photos, &options.losses)];
         if !virtual_views.images.is_empty() {
-            let losses = (&Losses::VIRTUAL, options.min_confidence);
-            views.add(device, virtual_views.photos(), losses, start.len(), 0)?;
+            groups.push((virtual_views.photos(), &Losses::VIRTUAL));
         }
+        let views = Views::new(device, &groups, confidence, start.len(), 0, scale.near())?;
         let model = Model::new(device, start, 0)?;
         let order = ViewOrder::new(photos.cameras.len(), virtual_views.cameras.len(), options.seed);
         let cameras = [photos.cameras, &virtual_views.cameras].concat();
@@ -293,7 +293,7 @@ impl<'a> Run<'a> {
         let Some(poses) = self.options.poses.filter(|p| view > 0 && iteration >= p.start) else {
             return Ok(());
         };
-        let g = self.trainer.views.stage(view).raster.frame().camera_grad.read()?;
+        let g = self.trainer.views.raster.frame().camera_grad.read()?;
         let twist = [g[0], g[1], g[2], g[3], g[4], g[5]].map(f64::from);
         let rate = poses.rate.at(iteration);
         let pose = &mut self.trainer.cameras[view].pose;
@@ -306,8 +306,8 @@ impl<'a> Run<'a> {
         let t = &mut self.trainer;
         t.model.check(step)?;
         let (photo, is_old) = self.last;
-        // A virtual view of the same size overwrites the render.
-        let rendered = if is_old { None } else { t.views.last_render(photo)? };
+        // A virtual view overwrites the render.
+        let rendered = if is_old { None } else { t.views.last_render()? };
         let rendered = match rendered {
             Some(rendered) => rendered,
             None => t.views.render(photo, &t.cameras[photo], &t.model, &t.raster)?,
@@ -405,19 +405,19 @@ impl Training for Run<'_> {
 
     fn record(&self, view: usize) -> Recorder {
         let Trainer { device, raster, model, views, .. } = &self.trainer;
-        let (item, stage) = (&views.list[view], views.stage(view));
-        let frame = stage.raster.frame();
+        let (item, rasterizer) = (&views.list[view], &views.raster);
+        let frame = rasterizer.frame();
         let mut rec = Recorder::new(device, "rgb step");
-        stage.raster.record_projection(&mut rec, &model.values, raster);
-        for band in frame.bands.iter() {
-            stage.raster.record_band(&mut rec, &model.values, &band);
-            self.losses(view).record_image(&mut rec, stage, item, &band);
-            stage.raster.record_band_backward(&mut rec, &model.values, raster, &band);
+        rasterizer.record_projection(&mut rec, &model.values, raster);
+        for band in item.bands.iter() {
+            rasterizer.record_band(&mut rec, &model.values, &band);
+            self.losses(view).record_image(&mut rec, views, item, &band);
+            rasterizer.record_band_backward(&mut rec, &model.values, raster, &band);
         }
         let needles = self.losses(view).ratio_penalty(model.count());
-        model.record_update(&mut rec, &stage.raster, raster, needles);
+        model.record_update(&mut rec, rasterizer, raster, needles);
         rec.download(&frame.status);
-        rec.download(&stage.sums);
+        rec.download(&views.sums);
         if self.options.poses.is_some() {
             rec.download(&frame.camera_grad);
         }
@@ -430,9 +430,9 @@ impl Training for Run<'_> {
             return Ok(());
         }
         self.last = (view, false);
-        let stage = self.trainer.views.stage(view);
-        let [l1, ssim, ..] = stage.total()?;
-        let loss = stage.loss.loss([l1, ssim], self.trainer.views.list[view].covered);
+        let views = &self.trainer.views;
+        let [l1, ssim, ..] = views.total(view)?;
+        let loss = ImageLoss::of(&views.list[view].bands, [l1, ssim], views.list[view].covered);
         let losses = self.losses(view);
         let has_ssim = losses.dssim > 0.0;
         self.recent.push(StepLoss { total: losses.photos(&loss), ssim: has_ssim.then_some(loss.ssim) });

@@ -59,7 +59,7 @@ pub(crate) trait Training {
             program.run()?;
             let trainer = self.trainer_mut();
             trainer.programs[view] = Some(program);
-            let raster = &mut trainer.views.stage_mut(view).raster;
+            let raster = &mut trainer.views.raster;
             match raster.overflow()? {
                 None => break,
                 Some(needed) => {
@@ -129,13 +129,9 @@ impl Trainer {
         self.programs.iter_mut().for_each(|p| *p = None);
     }
 
-    /// Resources of a step on view 0.
+    /// Resources of the last step.
     pub(crate) fn step_resources(&self) -> StepResources<'_> {
-        StepResources {
-            raster: &self.views.stage(0).raster,
-            params: &self.model.values,
-            options: &self.raster,
-        }
+        StepResources { raster: &self.views.raster, params: &self.model.values, options: &self.raster }
     }
 }
 
@@ -309,6 +305,41 @@ mod tests {
         )
         .unwrap();
         measure(device, &mut run)
+    }
+
+    /// Views of two sizes put their gradients at different places of one buffer.
+    #[test]
+    fn sizes_leave_each_other_no_gradients() {
+        let device = device(false);
+        let (splats, mut cameras, mut images) = scene();
+        (cameras[1].width, cameras[1].height) = (53, 75);
+        (images[1].width, images[1].height) = (53, 75);
+        let options = LanguageOptions { detach_geometry: true, ..LanguageOptions::preset(Preset::Draft) };
+        let level = LevelField {
+            codebook: Codebook {
+                embedding_dim: 1,
+                code_dim: 1,
+                embeddings: vec![1.0],
+                codes: vec![1.0],
+                ..Codebook::default()
+            },
+            targets: images
+                .iter()
+                .map(|i| Image { width: i.width, height: i.height, data: vec![0; i.data.len()] })
+                .collect(),
+            ..LevelField::default()
+        };
+        let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
+        let mut run =
+            LanguageRun::new(&device, photos, &splats, &[(0, &level)], &options, &crate::progress::Silent)
+                .unwrap();
+        for iteration in 0..4 {
+            run.step(iteration).unwrap();
+            let frame = run.trainer().step_resources().raster.frame();
+            let (pixels, written) = (frame.pixels() as usize, frame.planes_grad.read().unwrap());
+            assert!(written[..4 * pixels].iter().all(|g| *g == 0.0), "gradients by colours");
+            assert!(written[4 * pixels..5 * pixels].iter().any(|g| *g != 0.0));
+        }
     }
 
     #[test]

@@ -1,7 +1,6 @@
-//! Training views in GPU memory, in the bands that the device binds, and one rasteriser per image
-//! size.
+//! Training views in GPU memory, in the bands that the device binds, with one rasteriser.
 use crate::gpu::{self, Buffer, Device};
-use crate::pass::bands::Band;
+use crate::pass::bands::{Band, Bands};
 use crate::pass::metrics::planar;
 use crate::pass::ssim_l1::SsimL1;
 use crate::pass::view::View;
@@ -15,8 +14,9 @@ use super::photos::Photos;
 
 /// One training view.
 pub(super) struct TrainView {
-    /// Index into [`Views::stages`].
-    pub(super) stage: usize,
+    /// Width and height, pixels.
+    pub(super) size: [u32; 2],
+    pub(super) bands: Bands,
     /// Per band [3, rows, W] of the photo, or [4, rows, W] with pixel weights where some are
     /// unused.
     pub(super) target: Vec<Buffer<f32>>,
@@ -30,129 +30,76 @@ pub(super) struct TrainView {
     pub(super) depth: Option<(Vec<Buffer<f32>>, usize)>,
 }
 
-/// Buffers that views of one size share.
-pub(super) struct SizeBuffers {
+/// All training views. Rasteriser and scratch memory have room for the largest; the rasteriser has
+/// the size of one view at a time.
+pub(super) struct Views {
+    pub(super) list: Vec<TrainView>,
     pub(super) raster: Rasterizer,
     pub(super) loss: SsimL1,
     /// Per band Σ|x−y|, ΣSSIM, language loss, unused: [`SUMS`] floats.
     pub(super) sums: Buffer<f32>,
-}
-
-/// Loss sums of a band.
-pub(super) const SUMS: usize = 4;
-
-impl SizeBuffers {
-    fn new(device: &Device, capacity: usize, feature_dim: usize, size: [u32; 2]) -> Result<SizeBuffers> {
-        let raster = Rasterizer::new(device, capacity, feature_dim, size[0], size[1])?;
-        let loss = SsimL1::new(device, &raster.frame().bands)?;
-        let sums = device.buffer::<f32>("loss sums", SUMS * raster.frame().bands.count())?;
-        Ok(SizeBuffers { raster, loss, sums })
-    }
-
-    /// Slot of the first sum of a band.
-    pub(super) fn slot(&self, band: &Band) -> u32 {
-        (SUMS * band.index) as u32
-    }
-
-    /// The [`SUMS`] sums, added up over the bands.
-    pub(super) fn total(&self) -> Result<[f64; SUMS]> {
-        let sums = self.sums.read()?;
-        Ok(std::array::from_fn(|k| sums.iter().skip(k).step_by(SUMS).map(|v| f64::from(*v)).sum()))
-    }
-}
-
-/// All training views.
-pub(super) struct Views {
-    pub(super) list: Vec<TrainView>,
-    pub(super) stages: Vec<SizeBuffers>,
     near: f64,
 }
 
+/// Loss sums of a band.
+const SUMS: usize = 4;
+
+/// Slot of the first sum of a band.
+pub(super) fn slot(band: &Band) -> u32 {
+    (SUMS * band.index) as u32
+}
+
 impl Views {
-    /// Uploads the photos and the inputs of the losses, and allocates the rasterisers, for
-    /// `capacity` splats with `feature_dim` features. Depth is used from `min_confidence` on.
+    /// Uploads photos with the inputs of their losses, and allocates for `capacity` splats with
+    /// `feature_dim` features. Depth is used from `min_confidence` on.
     pub(super) fn new(
         device: &Device,
-        photos: Photos,
-        losses: (&Losses, f32),
+        groups: &[(Photos, &Losses)],
+        min_confidence: f32,
         capacity: usize,
         feature_dim: usize,
         near: f64,
     ) -> Result<Self> {
-        let mut views = Views { list: Vec::new(), stages: Vec::new(), near };
-        views.add(device, photos, losses, capacity, feature_dim)?;
-        Ok(views)
-    }
-
-    /// Adds photos behind the others.
-    pub(super) fn add(
-        &mut self,
-        device: &Device,
-        Photos { images, cameras, depths, coverage }: Photos,
-        (losses, min_confidence): (&Losses, f32),
-        capacity: usize,
-        feature_dim: usize,
-    ) -> Result<()> {
-        let depths = depths.filter(|_| losses.depth.is_some());
-        check_inputs(images, cameras)?;
-        for (i, image) in images.iter().enumerate() {
-            let size = [image.width as u32, image.height as u32];
-            let same = |s: &SizeBuffers| [s.raster.frame().width, s.raster.frame().height] == size;
-            let stage = match self.stages.iter().position(same) {
-                Some(found) => found,
-                None => {
-                    self.stages.push(SizeBuffers::new(device, capacity, feature_dim, size)?);
-                    self.stages.len() - 1
-                }
-            };
-            let depth = depths.and_then(|maps| maps.get(i));
-            let depth = depth.map(|m| confident_depth(m, min_confidence, image)).transpose()?.flatten();
-            let bands = &self.stages[stage].raster.frame().bands;
-            let depth = match depth {
-                Some((map, count)) => {
-                    let band = |b| device.buffer_from("stereo depth", &bands.cut_inner(&b, &map, 0.0));
-                    Some((bands.iter().map(band).collect::<gpu::Result<_>>()?, count))
-                }
-                None => None,
-            };
-            let coverage = coverage.get(i).and_then(Option::as_ref);
-            let mut photo = planar(image);
-            let covered = match coverage {
-                Some(c) if c.outside == Outside::Unknown => {
-                    let weights = c.weights().data;
-                    photo.extend(&weights);
-                    // Without used pixels the loss is 0, also divided by 1.
-                    Some(weights.iter().map(|w| f64::from(*w)).sum::<f64>().max(1.0))
-                }
-                _ => None,
-            };
-            let target = bands.iter().map(|b| device.buffer_from("photo", &bands.cut(&b, &photo)));
-            let target = target.collect::<gpu::Result<_>>()?;
-            let alpha = match losses.wanted_alpha(image.data.len(), coverage) {
-                Some((alpha, weight)) => {
-                    let band = |b| device.buffer_from("wanted alpha", &bands.cut_inner(&b, &alpha, -1.0));
-                    Some((bands.iter().map(band).collect::<gpu::Result<_>>()?, weight))
-                }
-                None => None,
-            };
-            self.list.push(TrainView { stage, target, covered, alpha, depth });
+        groups.iter().try_for_each(|(photos, _)| check_inputs(photos))?;
+        let images = groups.iter().flat_map(|(photos, _)| photos.images);
+        let sizes: Vec<[u32; 2]> = images.map(|i| [i.width as u32, i.height as u32]).collect();
+        let mut raster = Rasterizer::for_sizes(device, capacity, feature_dim, &sizes)?;
+        let mut list = Vec::with_capacity(sizes.len());
+        for (photos, losses) in groups {
+            for photo in 0..photos.images.len() {
+                let size = sizes[list.len()];
+                raster.set_size(size)?;
+                let bands = raster.frame().bands.clone();
+                list.push(upload(device, photos, photo, (losses, min_confidence), size, bands)?);
+            }
         }
-        Ok(())
+        let bands: Vec<Bands> = list.iter().map(|view| view.bands.clone()).collect();
+        let most_bands = bands.iter().map(Bands::count).max().unwrap_or(0);
+        let loss = SsimL1::new(device, &bands)?;
+        let sums = device.buffer::<f32>("loss sums", SUMS * most_bands)?;
+        Ok(Views { list, raster, loss, sums, near })
     }
 
-    /// Buffers of the size of a view.
-    pub(super) fn stage(&self, view: usize) -> &SizeBuffers {
-        &self.stages[self.list[view].stage]
+    /// Most pixels of a band.
+    pub(super) fn most_pixels(&self) -> usize {
+        self.list.iter().map(|view| view.bands.pixels()).max().unwrap_or(0)
     }
 
-    /// [`Views::stage`], mutable.
-    pub(super) fn stage_mut(&mut self, view: usize) -> &mut SizeBuffers {
-        &mut self.stages[self.list[view].stage]
+    /// Whether views have several sizes: gradients that one leaves lie in other planes of the next.
+    pub(super) fn have_several_sizes(&self) -> bool {
+        self.list.windows(2).any(|pair| pair[0].size != pair[1].size)
     }
 
-    /// Sets the camera of the next run on a view.
-    pub(super) fn set_camera(&self, view: usize, camera: &Camera) -> Result<()> {
-        self.stage(view).raster.set_view(&View::new(camera, self.near))
+    /// The [`SUMS`] sums of the last step, on `view`, added up over its bands.
+    pub(super) fn total(&self, view: usize) -> Result<[f64; SUMS]> {
+        let sums = self.sums.read_range(0..SUMS * self.list[view].bands.count())?;
+        Ok(std::array::from_fn(|k| sums.iter().skip(k).step_by(SUMS).map(|v| f64::from(*v)).sum()))
+    }
+
+    /// Sets size and camera of the next recording and run on a view.
+    pub(super) fn set_camera(&mut self, view: usize, camera: &Camera) -> Result<()> {
+        self.raster.set_size(self.list[view].size)?;
+        self.raster.set_view(&View::new(camera, self.near))
     }
 
     /// Renders the model from a camera: colours clipped to [0, 1].
@@ -170,20 +117,59 @@ impl Views {
             image.data.extend(colours(frame, band)?);
             Ok(())
         };
-        self.stage_mut(view).raster.forward_bands(&model.values, options, read)?;
+        self.raster.forward_bands(&model.values, options, read)?;
         Ok(image)
     }
 
-    /// Last render of the rasteriser of a view, with colours clipped to [0, 1]; `None` where the
-    /// image has several bands.
-    pub(super) fn last_render(&self, view: usize) -> Result<Option<RgbImage>> {
-        let frame = self.stage(view).raster.frame();
+    /// Last render, with colours clipped to [0, 1]; `None` where the image has several bands.
+    pub(super) fn last_render(&self) -> Result<Option<RgbImage>> {
+        let frame = self.raster.frame();
         if frame.bands.count() > 1 {
             return Ok(None);
         }
         let data = colours(frame, &frame.bands.get(0))?;
         Ok(Some(RgbImage { width: frame.width as usize, height: frame.height as usize, data }))
     }
+}
+
+/// One photo with the inputs of its losses.
+fn upload(
+    device: &Device,
+    Photos { images, depths, coverage, .. }: &Photos,
+    photo: usize,
+    (losses, min_confidence): (&Losses, f32),
+    size: [u32; 2],
+    bands: Bands,
+) -> Result<TrainView> {
+    let image = &images[photo];
+    let depth = depths.filter(|_| losses.depth.is_some()).and_then(|maps| maps.get(photo));
+    let depth = depth.map(|m| confident_depth(m, min_confidence, image)).transpose()?.flatten();
+    let inner = |name, plane: &[f32], void: f32| -> Result<Vec<Buffer<f32>>> {
+        let band = |b| device.buffer_from(name, &bands.cut_inner(&b, plane, void));
+        Ok(bands.iter().map(band).collect::<gpu::Result<_>>()?)
+    };
+    let depth = match depth {
+        Some((map, count)) => Some((inner("stereo depth", &map, 0.0)?, count)),
+        None => None,
+    };
+    let coverage = coverage.get(photo).and_then(Option::as_ref);
+    let mut planes = planar(image);
+    let covered = match coverage {
+        Some(c) if c.outside == Outside::Unknown => {
+            let weights = c.weights().data;
+            planes.extend(&weights);
+            // Without used pixels the loss is 0, also divided by 1.
+            Some(weights.iter().map(|w| f64::from(*w)).sum::<f64>().max(1.0))
+        }
+        _ => None,
+    };
+    let target = bands.iter().map(|b| device.buffer_from("photo", &bands.cut(&b, &planes)));
+    let target = target.collect::<gpu::Result<_>>()?;
+    let alpha = match losses.wanted_alpha(image.data.len(), coverage) {
+        Some((alpha, weight)) => Some((inner("wanted alpha", &alpha, -1.0)?, weight)),
+        None => None,
+    };
+    Ok(TrainView { size, bands, target, covered, alpha, depth })
 }
 
 /// Colours of the inner pixels of a band, clipped to [0, 1].
@@ -210,7 +196,7 @@ fn confident_depth(map: &DepthMap, least: f32, image: &RgbImage) -> Result<Optio
     Ok((count > 0).then_some((depth, count)))
 }
 
-fn check_inputs(images: &[RgbImage], cameras: &[Camera]) -> Result<()> {
+fn check_inputs(Photos { images, cameras, .. }: &Photos) -> Result<()> {
     if images.is_empty() || images.len() != cameras.len() {
         return Err(Error::work(format!(
             "training needs one camera per photo and got {} photos and {} cameras",
@@ -218,7 +204,7 @@ fn check_inputs(images: &[RgbImage], cameras: &[Camera]) -> Result<()> {
             cameras.len()
         )));
     }
-    for (image, camera) in images.iter().zip(cameras) {
+    for (image, camera) in images.iter().zip(*cameras) {
         if image.width != camera.width as usize || image.height != camera.height as usize {
             return Err(Error::work(format!(
                 "photo {} is {} × {} but its camera is for {} × {}",

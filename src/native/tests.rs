@@ -80,12 +80,21 @@ fn ssim_and_l1_match_shaders() {
             });
             let run = |device: &Device| {
                 let bands = Bands::whole(width, height);
-                let pass = SsimL1::with(device, &bands, SsimRowKernel::Strips).unwrap();
+                let pass = SsimL1::with(device, std::slice::from_ref(&bands), SsimRowKernel::Strips).unwrap();
                 let (x, y) = (device.buffer_from("x", &x).unwrap(), device.buffer_from("y", &y).unwrap());
                 let gradient = device.buffer::<f32>("gradient", 3 * pixels).unwrap();
                 let sums = device.buffer::<f32>("sums", 4).unwrap();
                 let mut rec = Recorder::new(device, "loss");
-                pass.record(&mut rec, &bands.get(0), &x, &y, &gradient, covered, weights, (&sums, 1));
+                pass.record(
+                    &mut rec,
+                    (&bands, &bands.get(0)),
+                    &x,
+                    &y,
+                    &gradient,
+                    covered,
+                    weights,
+                    (&sums, 1),
+                );
                 rec.run().unwrap();
                 (gradient.read().unwrap(), sums.read().unwrap())
             };

@@ -8,7 +8,8 @@
 use super::bands::Band;
 use super::frame::{FrameBuffers, Tiles};
 use super::raster_forward::{Cutoffs, ReferenceScene, walk};
-use super::tile_lists::TILE;
+use super::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
+use super::tile_lists::{Lists, TILE};
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use rayon::prelude::*;
@@ -192,6 +193,52 @@ impl LabelWeights {
     /// The labels of a splat with their sums. Labels of all levels are distinct numbers.
     pub fn of(&self, splat: usize) -> &[(i32, f32)] {
         &self.rows[splat]
+    }
+}
+
+impl Rasterizer {
+    /// Adds the blending weights of the last set view to `sums`, by label. `labels` are
+    /// [levels, H·W], −1 for pixels without one. Grows tile lists that are too short.
+    pub fn add_label_weights(
+        &mut self,
+        params: &SplatBuffers,
+        options: &RasterOptions,
+        labels: &[i32],
+        sums: &mut LabelWeights,
+    ) -> Result<()> {
+        self.check(params)?;
+        let mut is_projected = false;
+        for index in 0..self.frame().bands.count() {
+            let band = self.frame().bands.get(index);
+            let labels = self.frame().bands.cut_inner(&band, labels, -1);
+            let sets = LabelSets::new(&self.device, self.frame(), &band, &labels)?;
+            let mut row = band.inner.start;
+            // Strips become narrower where the lists of one do not fit.
+            while let Some(tiles) = self.strips(&band, row..band.inner.end).into_iter().next() {
+                let mut rec = Recorder::new(&self.device, "tile lists");
+                if !is_projected {
+                    self.record_projection(&mut rec, params, options);
+                }
+                self.record_lists(&mut rec, params, &tiles, Lists::Used);
+                rec.download(&self.frame().status);
+                rec.run()?;
+                is_projected = true;
+                if let Some(needed) = self.overflow()? {
+                    self.grow(needed)?;
+                    continue;
+                }
+                let room = SLOTS * self.frame().lists.capacity;
+                let weights = self.device.buffer::<f32>("label weights", room)?;
+                for first_slot in sets.dispatches(&tiles) {
+                    let mut rec = Recorder::new(&self.device, "label weights");
+                    sets.record(&mut rec, self.frame(), &tiles, first_slot, &weights);
+                    rec.run()?;
+                    sets.add(self.frame(), &tiles, first_slot, &weights, sums)?;
+                }
+                row = (tiles.rows.end * TILE) as usize;
+            }
+        }
+        Ok(())
     }
 }
 

@@ -45,7 +45,6 @@ use super::frame::{
     entry_bytes,
 };
 use super::fused_update::{self, SplatAdam};
-use super::label_weights::{self, LabelSets, LabelWeights};
 use super::project::DEPTH_BITS;
 use super::project_backward::ShGradientKernel;
 use super::sort::{Prepared, Sort};
@@ -104,16 +103,18 @@ fn most_entries(
     tile_lists::most_entries(device, grouping, splats, tiles).min(gradients)
 }
 
-/// Renders up to N splats with d features at a fixed image size, and back-propagates gradients.
+/// Renders up to N splats with d features, and back-propagates gradients.
 pub struct Rasterizer {
-    device: Device,
+    pub(super) device: Device,
     capacity: usize,
+    /// Most pixels of a band, and tiles.
+    room: [usize; 2],
     camera: Buffer<CameraView>,
     frame: FrameBuffers,
     grouping: TileBinning,
     sh_gradients: ShGradientKernel,
     projection_groups: u32,
-    /// Rows of tiles that are binned at once.
+    /// Most rows of tiles that are binned at once.
     strip: u32,
     sort: Sort,
     /// [1] u32: N, read by the sort.
@@ -145,13 +146,37 @@ impl Rasterizer {
         height: u32,
         choices: DeviceChoices,
     ) -> Result<Rasterizer> {
-        if width == 0 || height == 0 {
-            return Err(Error::work("an image of zero size cannot be rendered"));
-        }
+        Rasterizer::allocate(device, capacity, feature_dim, &[[width, height]], choices)
+    }
+
+    /// [`Rasterizer::new`] for images of several (width, height), the first until
+    /// [`Rasterizer::set_size`].
+    pub fn for_sizes(
+        device: &Device,
+        capacity: usize,
+        feature_dim: usize,
+        sizes: &[[u32; 2]],
+    ) -> Result<Rasterizer> {
+        Rasterizer::allocate(device, capacity, feature_dim, sizes, DeviceChoices::of(device))
+    }
+
+    fn allocate(
+        device: &Device,
+        capacity: usize,
+        feature_dim: usize,
+        sizes: &[[u32; 2]],
+        choices: DeviceChoices,
+    ) -> Result<Rasterizer> {
         let planes = BASE_CHANNELS + feature_dim;
-        let bands = Bands::new(device.info(), width as usize, height as usize, planes)?;
-        let (pixels, strip) = (bands.pixels(), (bands.rows as u32).div_ceil(TILE));
-        let tiles = width.div_ceil(TILE) as usize * strip as usize;
+        let bands: Vec<Bands> =
+            sizes.iter().map(|size| bands_of(device, *size, planes)).collect::<Result<_>>()?;
+        let most = |count: fn(&Bands) -> usize| bands.iter().map(count).max().unwrap_or(0);
+        let room = [most(Bands::pixels), most(tiles_of)];
+        let [pixels, tiles] = room;
+        let ([width, height], bands) = match (sizes, bands.into_iter().next()) {
+            ([first, ..], Some(bands)) => (*first, bands),
+            _ => return Err(Error::work("a rasterizer without an image size")),
+        };
         let splats = capacity.max(1);
         let stride = feature_dim.next_multiple_of(4);
         // About five entries per splat on the seeded scene; `forward` grows lists that are too
@@ -188,15 +213,34 @@ impl Rasterizer {
         Ok(Rasterizer {
             device: device.clone(),
             capacity,
+            room,
             camera,
             frame,
             grouping: choices.grouping,
             sh_gradients: choices.sh_gradients,
             projection_groups: choices.projection_groups,
-            strip,
+            strip: u32::MAX,
             sort,
             count,
         })
+    }
+
+    /// Sets the image size of later recordings and reads. A recording keeps its own. Planes of an
+    /// image of another size keep its values until a pass writes them.
+    ///
+    /// # Errors
+    /// Where the size is larger than those allocated.
+    pub fn set_size(&mut self, [width, height]: [u32; 2]) -> Result<()> {
+        if [self.frame.width, self.frame.height] == [width, height] {
+            return Ok(());
+        }
+        let planes = BASE_CHANNELS + self.frame.feature_dim;
+        let bands = bands_of(&self.device, [width, height], planes)?;
+        if bands.pixels() > self.room[0] || tiles_of(&bands) > self.room[1] {
+            return Err(Error::work(format!("a rasterizer has no room for {width} × {height} pixels")));
+        }
+        (self.frame.width, self.frame.height, self.frame.bands) = (width, height, bands);
+        Ok(())
     }
 
     /// Output and gradient planes.
@@ -376,18 +420,25 @@ impl Rasterizer {
         fused_update::record(rec, params, &self.camera, &self.frame, self.projection_groups, state);
     }
 
-    fn record_lists(&self, rec: &mut Recorder, params: &SplatBuffers, tiles: &Tiles, state: Lists) {
+    pub(super) fn record_lists(
+        &self,
+        rec: &mut Recorder,
+        params: &SplatBuffers,
+        tiles: &Tiles,
+        state: Lists,
+    ) {
         rec.pass("binning");
         bin::record(rec, &self.frame, &tiles.rows, (params.count, &self.count), state);
     }
 
     /// Divides rows of pixels of a band into strips of tiles that are binned at once.
-    fn strips(&self, band: &Band, pixels: Range<usize>) -> Vec<Tiles> {
+    pub(super) fn strips(&self, band: &Band, pixels: Range<usize>) -> Vec<Tiles> {
         let rows = pixels.start as u32 / TILE..(pixels.end as u32).div_ceil(TILE);
+        let strip = self.strip.min(rows.len() as u32).max(1);
         rows.clone()
-            .step_by(self.strip.max(1) as usize)
+            .step_by(strip as usize)
             .map(|first| Tiles {
-                rows: first..(first + self.strip).min(rows.end),
+                rows: first..(first + strip).min(rows.end),
                 list_row: first,
                 top: band.top as u32,
             })
@@ -444,50 +495,6 @@ impl Rasterizer {
         }
     }
 
-    /// Adds the blending weights of the last set view to `sums`, by label. `labels` are
-    /// [levels, H·W], −1 for pixels without one. Grows tile lists that are too short.
-    pub fn add_label_weights(
-        &mut self,
-        params: &SplatBuffers,
-        options: &RasterOptions,
-        labels: &[i32],
-        sums: &mut LabelWeights,
-    ) -> Result<()> {
-        self.check(params)?;
-        let mut is_projected = false;
-        for index in 0..self.frame.bands.count() {
-            let band = self.frame.bands.get(index);
-            let labels = self.frame.bands.cut_inner(&band, labels, -1);
-            let sets = LabelSets::new(&self.device, &self.frame, &band, &labels)?;
-            let mut row = band.inner.start;
-            // Strips become narrower where the lists of one do not fit.
-            while let Some(tiles) = self.strips(&band, row..band.inner.end).into_iter().next() {
-                let mut rec = Recorder::new(&self.device, "tile lists");
-                if !is_projected {
-                    self.record_projection(&mut rec, params, options);
-                }
-                self.record_lists(&mut rec, params, &tiles, Lists::Used);
-                rec.download(&self.frame.status);
-                rec.run()?;
-                is_projected = true;
-                if let Some(needed) = self.overflow()? {
-                    self.grow(needed)?;
-                    continue;
-                }
-                let room = label_weights::SLOTS * self.frame.lists.capacity;
-                let weights = self.device.buffer::<f32>("label weights", room)?;
-                for first_slot in sets.dispatches(&tiles) {
-                    let mut rec = Recorder::new(&self.device, "label weights");
-                    sets.record(&mut rec, &self.frame, &tiles, first_slot, &weights);
-                    rec.run()?;
-                    sets.add(&self.frame, &tiles, first_slot, &weights, sums)?;
-                }
-                row = (tiles.rows.end * TILE) as usize;
-            }
-        }
-        Ok(())
-    }
-
     /// Number of entries that a frame needed since the last [`Rasterizer::grow`], if they did not
     /// fit; else `None`.
     ///
@@ -510,20 +517,20 @@ impl Rasterizer {
     /// Allocates tile lists for `needed` entries and a quarter more, or bins fewer rows of tiles at
     /// once where the device binds no longer lists. Earlier recordings must not be run again.
     pub fn grow(&mut self, needed: usize) -> Result<()> {
-        let tiles = self.frame.tiles()[0] as usize * (self.frame.bands.rows as u32).div_ceil(TILE) as usize;
-        let splats = self.capacity.max(1);
+        let (tiles, splats) = (self.room[1], self.capacity.max(1));
         let lists = (self.grouping, splats, tiles);
         let most = most_entries(&self.device, lists, self.frame.summation, self.frame.feature_dim);
         let wanted = needed + needed / 4;
         if needed > most {
-            if self.strip <= 1 {
+            let strip = self.strip.min((self.frame.bands.rows as u32).div_ceil(TILE));
+            if strip <= 1 {
                 return Err(Error::gpu(format!(
                     "{needed} entries of one row of tiles are more than {} takes at once ({most}): fewer splats or a smaller \
                      --max-size",
                     self.device.info().name
                 )));
             }
-            self.strip = ((u64::from(self.strip) * most as u64 / wanted as u64) as u32).max(1);
+            self.strip = ((u64::from(strip) * most as u64 / wanted as u64) as u32).max(1);
         }
         let capacity = wanted.min(most);
         self.frame.lists = TileLists::new(&self.device, self.grouping, splats, tiles, capacity)?;
@@ -533,14 +540,14 @@ impl Rasterizer {
     /// Tile lists of the last forward pass, row by row of tiles, nearest splat first. For tests and
     /// statistics.
     pub fn tile_lists(&self) -> Result<Vec<Vec<u32>>> {
-        let ranges = self.frame.lists.ranges.read()?;
+        let ranges = self.frame.lists.ranges.read_range(0..tiles_of(&self.frame.bands) + 1)?;
         let splats = self.frame.lists.splats.read()?;
         let list =
             |r: &[u32]| splats[2 * r[0] as usize..2 * r[1] as usize].iter().step_by(2).copied().collect();
         Ok(ranges.windows(2).map(list).collect())
     }
 
-    fn check(&self, params: &SplatBuffers) -> Result<()> {
+    pub(super) fn check(&self, params: &SplatBuffers) -> Result<()> {
         if params.count > self.capacity || params.feature_dim != self.frame.feature_dim {
             return Err(Error::work(format!(
                 "{} splats with {} features do not fit a rasterizer for {} with {}",
@@ -549,4 +556,16 @@ impl Rasterizer {
         }
         Ok(())
     }
+}
+
+fn bands_of(device: &Device, [width, height]: [u32; 2], planes: usize) -> Result<Bands> {
+    if width == 0 || height == 0 {
+        return Err(Error::work("an image of zero size cannot be rendered"));
+    }
+    Bands::new(device.info(), width as usize, height as usize, planes)
+}
+
+/// Tiles of a band.
+fn tiles_of(bands: &Bands) -> usize {
+    bands.width.div_ceil(TILE as usize) * bands.rows.div_ceil(TILE as usize)
 }

@@ -158,9 +158,8 @@ impl SsimRowKernel {
     }
 }
 
-/// GPU pass for one image size: scratch memory that all views of the size and their bands share.
+/// GPU pass: scratch memory that all views and their bands share.
 pub struct SsimL1 {
-    bands: Bands,
     rows: SsimRowKernel,
     means: Buffer<f32>,
     moments: Buffer<f32>,
@@ -172,38 +171,37 @@ pub struct SsimL1 {
 }
 
 impl SsimL1 {
-    /// Allocates for RGB images in these bands, with the fastest row kernel of the device.
-    pub fn new(device: &Device, bands: &Bands) -> Result<Self> {
+    /// Allocates for RGB images in any of these bands, with the fastest row kernel of the device.
+    pub fn new(device: &Device, bands: &[Bands]) -> Result<Self> {
         Self::with(device, bands, SsimRowKernel::of(device))
     }
 
     /// [`SsimL1::new`] with a given row kernel.
-    pub fn with(device: &Device, bands: &Bands, rows: SsimRowKernel) -> Result<Self> {
-        let (width, height) = (bands.width, bands.rows);
-        let values = CHANNELS * width * height;
+    pub fn with(device: &Device, bands: &[Bands], rows: SsimRowKernel) -> Result<Self> {
+        let most = |count: fn(&Bands) -> usize| bands.iter().map(count).max().unwrap_or(0);
+        let values = most(|b| CHANNELS * b.pixels());
         let pairs = |name| device.buffer::<f32>(name, 2 * values);
         Ok(SsimL1 {
-            bands: bands.clone(),
             rows,
             means: pairs("ssim means")?,
             moments: pairs("ssim moments")?,
             slopes: pairs("ssim slopes")?,
             cross: device.buffer::<f32>("ssim cross slopes", values)?,
-            ssim_sums: device.buffer::<f32>("ssim sums", CHANNELS * height * width.div_ceil(STRIP))?,
-            l1_sums: device.buffer::<f32>("l1 sums", CHANNELS * width * height.div_ceil(STRIP))?,
+            ssim_sums: device.buffer::<f32>("ssim sums", most(ssim_sums))?,
+            l1_sums: device.buffer::<f32>("l1 sums", most(l1_sums))?,
             partials: device.buffer::<f32>("loss partials", sum::PARTIALS)?,
         })
     }
 
-    /// Records the pass for a band. `rendered` and `gradient` are planar `[≥3, rows, W]` stacks
+    /// Records the pass for one of `bands`. `rendered` and `gradient` are planar `[≥3, rows, W]` stacks
     /// with RGB first, `target` is `[3, rows, W]`. With `covered`, the sum of the pixel weights of
     /// the whole image, `target` is `[4, rows, W]`, the last plane the weights. Writes Σ|x−y| of
     /// the band to `loss[slot]` and, unless its weight is 0, ΣSSIM to `loss[slot+1]`: see
-    /// [`SsimL1::loss`]. `weights` are those of L1 and 1 − SSIM.
+    /// [`ImageLoss::of`]. `weights` are those of L1 and 1 − SSIM.
     pub fn record(
         &self,
         rec: &mut Recorder,
-        band: &Band,
+        (bands, band): (&Bands, &Band),
         rendered: &Buffer<f32>,
         target: &Buffer<f32>,
         gradient: &Buffer<f32>,
@@ -213,11 +211,11 @@ impl SsimL1 {
     ) {
         let with_ssim = weights[1] != 0.0;
         rec.pass(if with_ssim { "SSIM + L1" } else { "L1" });
-        let (width, height) = (self.bands.width as i32, self.bands.rows as i32);
+        let (width, height) = (bands.width as i32, bands.rows as i32);
         let (first, end) = ((band.inner.start - band.top) as i32, (band.inner.end - band.top) as i32);
-        let (count, weighted) = (self.values(covered), i32::from(covered.is_some()));
+        let (count, weighted) = (values(bands, covered), i32::from(covered.is_some()));
         let strips = |n: usize| n.div_ceil(STRIP) as u32;
-        let columns = [(width as u32).div_ceil(64), strips(self.bands.rows), CHANNELS as u32];
+        let columns = [(width as u32).div_ceil(64), strips(bands.rows), CHANNELS as u32];
         if with_ssim {
             let call = shaders::ssim_columns::call(
                 &shaders::ssim_columns::Bindings {
@@ -229,7 +227,7 @@ impl SsimL1 {
                 &shaders::ssim_columns::Push { width, height, weighted },
             );
             rec.dispatch(call, columns);
-            self.record_rows(rec, first, end);
+            self.record_rows(rec, bands, first, end);
         }
         let call = shaders::ssim_gradient::call(
             shaders::ssim_gradient::Variant { ssim: u32::from(with_ssim) },
@@ -252,14 +250,15 @@ impl SsimL1 {
             },
         );
         rec.dispatch(call, columns);
-        sum::record(rec, &self.l1_sums, &self.partials, loss.0, loss.1);
+        sum::record(rec, (&self.l1_sums, l1_sums(bands)), &self.partials, loss);
         if with_ssim {
-            sum::record(rec, &self.ssim_sums, &self.partials, loss.0, loss.1 + 1);
+            let sums = (&self.ssim_sums, ssim_sums(bands));
+            sum::record(rec, sums, &self.partials, (loss.0, loss.1 + 1));
         }
     }
 
-    fn record_rows(&self, rec: &mut Recorder, first: i32, end: i32) {
-        let (width, height) = (self.bands.width as u32, self.bands.rows as u32);
+    fn record_rows(&self, rec: &mut Recorder, bands: &Bands, first: i32, end: i32) {
+        let (width, height) = (bands.width as u32, bands.rows as u32);
         let strips = width.div_ceil(STRIP as u32);
         let (means, moments, slopes) = (&self.means, &self.moments, &self.slopes);
         let (cross, sums) = (&self.cross, &self.ssim_sums);
@@ -283,18 +282,30 @@ impl SsimL1 {
             }
         }
     }
+}
 
-    /// Loss terms from the two sums of [`SsimL1::record`], added up over the bands.
-    pub fn loss(&self, sums: [f64; 2], covered: Option<f64>) -> ImageLoss {
-        let (all, count) = (self.values(None), self.values(covered));
+impl ImageLoss {
+    /// Loss terms of an image from the two sums of [`SsimL1::record`], added up over its bands.
+    pub fn of(bands: &Bands, sums: [f64; 2], covered: Option<f64>) -> ImageLoss {
+        let (all, count) = (values(bands, None), values(bands, covered));
         ImageLoss { l1: sums[0] / count, ssim: 1.0 - (all - sums[1]) / count }
     }
+}
 
-    /// Number of values of a mean.
-    fn values(&self, covered: Option<f64>) -> f64 {
-        let pixels = covered.unwrap_or((self.bands.width * self.bands.height) as f64);
-        CHANNELS as f64 * pixels
-    }
+/// Number of values of a mean.
+fn values(bands: &Bands, covered: Option<f64>) -> f64 {
+    let pixels = covered.unwrap_or((bands.width * bands.height) as f64);
+    CHANNELS as f64 * pixels
+}
+
+/// Sums of SSIM that the row kernels write.
+fn ssim_sums(bands: &Bands) -> usize {
+    CHANNELS * bands.rows * bands.width.div_ceil(STRIP)
+}
+
+/// Sums of |x − y| that the gradient kernel writes.
+fn l1_sums(bands: &Bands) -> usize {
+    CHANNELS * bands.width * bands.rows.div_ceil(STRIP)
 }
 
 #[cfg(test)]
@@ -390,17 +401,22 @@ mod tests {
                 ssim_l1_weighted(&wide(&x), &wide(&y), &wide(&weights), w, h, 0.8, 0.2);
             let covered = weighted.then(|| wide(&weights).iter().sum::<f64>());
             let bands = Bands::whole(w, h);
-            let pass = SsimL1::with(&device, &bands, rows).unwrap();
+            // Room for larger images, with the sums of one.
+            let pass = SsimL1::with(&device, &[bands.clone(), Bands::whole(w + 30, h + 20)], rows).unwrap();
+            for sums in [&pass.l1_sums, &pass.ssim_sums] {
+                sums.write(&vec![1.0; (sums.bytes() / 4) as usize]).unwrap();
+            }
             let rendered = device.buffer_from("x", &x).unwrap();
             let stack = if weighted { [&y[..], &weights].concat() } else { y.clone() };
             let target = device.buffer_from("y", &stack).unwrap();
             let out = device.buffer::<f32>("gradient", 3 * w * h).unwrap();
             let sums = device.buffer::<f32>("loss", 4).unwrap();
             let mut rec = Recorder::new(&device, "ssim");
-            pass.record(&mut rec, &bands.get(0), &rendered, &target, &out, covered, [0.8, 0.2], (&sums, 1));
+            let band = (&bands, &bands.get(0));
+            pass.record(&mut rec, band, &rendered, &target, &out, covered, [0.8, 0.2], (&sums, 1));
             rec.run().unwrap();
             let sums = sums.read().unwrap();
-            let loss = pass.loss([sums[1], sums[2]].map(f64::from), covered);
+            let loss = ImageLoss::of(&bands, [sums[1], sums[2]].map(f64::from), covered);
             // f32 sums of about 10⁴ values of order one: 1e-5.
             assert!(
                 (loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5,

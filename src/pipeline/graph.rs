@@ -23,6 +23,8 @@ struct Node<'g> {
     name: &'static str,
     lane: Lane,
     needs: Vec<usize>,
+    /// A stage that ends before this one starts, though it gives no input.
+    after: Option<usize>,
     settings: String,
     work: Mutex<Option<Work<'g>>>,
     load: Load<'g>,
@@ -34,6 +36,7 @@ struct Node<'g> {
 #[derive(Default)]
 pub struct Graph<'g> {
     nodes: Vec<Node<'g>>,
+    after: Option<usize>,
 }
 
 /// Outputs of the targets of [`Graph::run`].
@@ -74,6 +77,11 @@ impl Outputs {
 }
 
 impl<'g> Graph<'g> {
+    /// The stages added from here on start when `output` is there, if the run computes it.
+    pub fn after<T>(&mut self, output: Output<T>) {
+        self.after = Some(output.node);
+    }
+
     /// Adds a stage with its inputs.
     pub fn add<S: Stage + 'g>(&mut self, stage: S, inputs: S::Inputs) -> Output<S::Output> {
         let settings = stage.settings();
@@ -97,6 +105,7 @@ impl<'g> Graph<'g> {
             name: S::NAME,
             lane: S::LANE,
             needs: inputs.nodes(),
+            after: self.after,
             settings,
             work: Mutex::new(Some(Box::new(work))),
             load: Box::new(load),
@@ -173,6 +182,7 @@ impl<'g> Graph<'g> {
         let n = self.nodes.len();
         let mut state = State {
             waiting: BTreeSet::new(),
+            pending: BTreeSet::new(),
             values: vec![None; n],
             seconds: keys.iter().map(|key| store.seconds(key)).collect(),
             warnings: vec![Vec::new(); n],
@@ -192,6 +202,7 @@ impl<'g> Graph<'g> {
                 state.kept.push(self.nodes[node].name);
             } else {
                 state.waiting.insert(node);
+                state.pending.insert(node);
                 for &need in &self.nodes[node].needs {
                     state.users[need] += 1;
                     pending.insert(need);
@@ -226,6 +237,8 @@ pub(crate) fn program() -> &'static str {
 struct State {
     /// Stages that have not started.
     waiting: BTreeSet<usize>,
+    /// Stages that have not ended.
+    pending: BTreeSet<usize>,
     values: Vec<Option<Value>>,
     /// Seconds that each stage ran, here or in an earlier graph of the store.
     seconds: Vec<f64>,
@@ -285,6 +298,7 @@ impl Shared<'_, '_> {
             let checkpoint = recorder.checkpoint;
             scope.spawn(move || self.save(node, kept_value, &kept_warnings, checkpoint, progress));
             let mut state = self.lock();
+            state.pending.remove(&node);
             (state.values[node], state.seconds[node]) = (Some(value), seconds);
             state.warnings[node] = warnings;
             for &need in &stage.needs {
@@ -337,7 +351,11 @@ impl Shared<'_, '_> {
                 return None;
             }
             let inputs = |n: &usize| -> Option<Vec<Value>> {
-                self.graph.nodes[*n].needs.iter().map(|need| state.values[*need].clone()).collect()
+                let node = &self.graph.nodes[*n];
+                if node.after.is_some_and(|after| state.pending.contains(&after)) {
+                    return None;
+                }
+                node.needs.iter().map(|need| state.values[*need].clone()).collect()
             };
             let ready = state.waiting.iter().filter(in_lane).find_map(|n| Some((*n, inputs(n)?)));
             if let Some((node, inputs)) = ready {

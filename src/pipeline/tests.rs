@@ -283,3 +283,40 @@ fn parallel_lanes_report_the_first_error() {
     let panicked = std::panic::catch_unwind(|| pair([long, |_| std::panic::panic_any("oh")]));
     assert_eq!(panicked.unwrap_err().downcast_ref::<&str>(), Some(&"oh"));
 }
+
+/// Reads a flag, or sets it after a while.
+struct Flag<const SETS: bool>(Arc<AtomicUsize>);
+
+impl<const SETS: bool> Stage for Flag<SETS> {
+    const NAME: &'static str = "flag";
+    const LANE: Lane = if SETS { Lane::Device } else { Lane::Processor };
+    type Inputs = ();
+    type Output = usize;
+    fn settings(&self) -> String {
+        SETS.to_string()
+    }
+    fn run(self, (): (), _: &Context) -> Result<usize> {
+        if SETS {
+            std::thread::sleep(Duration::from_millis(50));
+            self.0.store(1, Ordering::SeqCst);
+        }
+        Ok(self.0.load(Ordering::SeqCst))
+    }
+}
+
+#[test]
+fn after_delays_later_stages() {
+    let machine = Machine::new();
+    let seen = |waits: bool, both: bool| {
+        let (flag, mut graph) = (Arc::new(AtomicUsize::new(0)), Graph::default());
+        let first = graph.add(Flag::<true>(flag.clone()), ());
+        if waits {
+            graph.after(first);
+        }
+        let second = graph.add(Flag::<false>(flag), ());
+        let targets = if both { vec![first.target(), second.target()] } else { vec![second.target()] };
+        *machine.run(&graph, &targets, &Store::none()).unwrap().0.get(second).unwrap()
+    };
+    assert_eq!((seen(true, true), seen(false, true)), (1, 0));
+    assert_eq!(seen(true, false), 0, "the first stage is not part of the run");
+}

@@ -135,22 +135,16 @@ fn training_bytes(
     features: usize,
 ) -> Result<u64> {
     let (channels, splats) = (BASE_CHANNELS + features, splats as u64);
-    let mut distinct: Vec<(usize, usize)> = Vec::new();
-    sizes.iter().for_each(|s| {
-        if !distinct.contains(s) {
-            distinct.push(*s)
-        }
-    });
-    let mut bytes = 0;
-    for &(w, h) in &distinct {
-        let stored = Bands::new(device, w, h, channels)?.pixels() as u64;
-        // Planes and their gradients; transmittance, loss; SSIM: three vec2 and one float per
-        // colour.
-        bytes += stored * (4 * (2 * channels as u64 + 1) + 8 + 84);
-        // Projected splats: 12 + 12 floats, the features and their gradients, depth keys and their
-        // sort; eight entries of 20 bytes in the lists.
-        bytes += splats * (96 + 8 * features as u64 + 16 + 160);
+    // All photos share the memory of the largest.
+    let mut stored = 0;
+    for &(w, h) in sizes {
+        stored = stored.max(Bands::new(device, w, h, channels)?.pixels() as u64);
     }
+    // Planes and their gradients; transmittance, loss; SSIM: three vec2 and one float per colour.
+    let mut bytes = stored * (4 * (2 * channels as u64 + 1) + 8 + 84);
+    // Projected splats: 12 + 12 floats, the features and their gradients, depth keys and their
+    // sort; eight entries of 20 bytes in the lists.
+    bytes += splats * (96 + 8 * features as u64 + 16 + 160);
     // Photo, wanted alpha; depth, or a label per level.
     bytes += sizes.iter().map(pixels).sum::<u64>() * (16 + if features > 0 { 12 } else { 4 });
     // Value, gradient and two moments of each parameter, at SH degree 0; the fused update stores no

@@ -111,6 +111,7 @@ impl ScenePlan<'_> {
             (Some(language), Some(encoder)) => {
                 // Queries come first: a table of embeddings may lack one of their phrases.
                 let query_inputs = self.query_inputs(encoder);
+                self.share_processor(geometry);
                 let build = &mut self.build;
                 let masks = sources::make::<MaskSources>(&language.masks, &registry, (build, posed))?;
                 let build = &mut self.build;
@@ -156,6 +157,7 @@ impl ScenePlan<'_> {
         let language = match (&self.config.language, encoder) {
             (Some(language), Some(encoder)) => {
                 let query_inputs = self.query_inputs(encoder);
+                self.share_processor(geometry);
                 let graph = &mut self.build.graph;
                 let new = PosedPhotos {
                     placed: graph.add(stages::OnlyAdded { known }, (placed,)),
@@ -182,6 +184,14 @@ impl ScenePlan<'_> {
         let registry = &self.build.registry;
         let language = self.config.language.as_ref();
         language.map(|l| sources::make::<FeatureSources>(&l.features, registry, registry)).transpose()
+    }
+
+    /// On a CPU device the networks of the language wait for the geometry, so that the first picture
+    /// is there sooner: training has time for them beside it.
+    fn share_processor(&mut self, geometry: Output<pose::Geometry>) {
+        if self.device.info().is_cpu {
+            self.build.graph.after(geometry);
+        }
     }
 
     fn view_dependence(&mut self, placed: Output<PlacedPhotos>, trained: Output<Trained>) -> Output<Trained> {

@@ -7,7 +7,7 @@ use crate::fit::schedule::Exponential;
 use crate::gpu::{Buffer, Device, Program, Recorder};
 use crate::pass::metrics::planar;
 use crate::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
-use crate::pass::ssim_l1::SsimL1;
+use crate::pass::ssim_l1::{ImageLoss, SsimL1};
 use crate::pass::view::View;
 use crate::photo::PlainBorder as Border;
 use crate::pose::numeric::rotation_angle;
@@ -98,7 +98,7 @@ impl ViewRefiner {
         if bands.count() > 1 {
             return Ok(camera.pose);
         }
-        let loss = SsimL1::new(&self.device, &bands)?;
+        let loss = SsimL1::new(&self.device, std::slice::from_ref(&bands))?;
         let sums = self.device.buffer::<f32>("loss sums", 4)?;
         raster.set_view(&View::new(camera, scale.near()))?;
         raster.forward(&self.params, &self.options)?;
@@ -125,7 +125,8 @@ impl ViewRefiner {
                 break;
             }
             let s = sums.read()?;
-            let total = loss.loss([s[0], s[1]].map(f64::from), None).total(WEIGHTS[0], WEIGHTS[1]);
+            let total =
+                ImageLoss::of(&bands, [s[0], s[1]].map(f64::from), None).total(WEIGHTS[0], WEIGHTS[1]);
             if total < best.0 {
                 best = (total, pose);
             }
@@ -149,7 +150,8 @@ impl ViewRefiner {
         let mut rec = Recorder::new(&self.device, "refine view");
         raster.record_forward(&mut rec, &self.params, &self.options);
         let whole = frame.bands.get(0);
-        loss.record(&mut rec, &whole, &frame.planes, target, &frame.planes_grad, None, WEIGHTS, (sums, 0));
+        let (bands, gradient) = ((&frame.bands, &whole), &frame.planes_grad);
+        loss.record(&mut rec, bands, &frame.planes, target, gradient, None, WEIGHTS, (sums, 0));
         raster.record_backward(&mut rec, &self.params, &self.options, &self.gradients);
         rec
     }

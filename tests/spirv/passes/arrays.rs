@@ -45,7 +45,7 @@ pub fn sum(device: &Device) {
         let partials = device.buffer::<f32>("sum partials", sum::PARTIALS).unwrap();
         let result = device.buffer::<f32>("sum result", 3).unwrap();
         let mut rec = Recorder::new(device, "sum");
-        sum::record(&mut rec, &input, &partials, &result, 1);
+        sum::record(&mut rec, (&input, n), &partials, (&result, 1));
         rec.run().unwrap();
         let expected: f64 = values.iter().map(|v| f64::from(*v)).sum();
         let got = result.read().unwrap();

@@ -181,17 +181,18 @@ pub fn ssim_l1(device: &Device) {
         let (expected, gradient) =
             image_loss::ssim_l1_weighted(&wide(&x), &wide(&y), &wide(&weights), w, h, 0.8, 0.2);
         let bands = Bands::whole(w, h);
-        let pass = image_loss::SsimL1::with(device, &bands, rows).unwrap();
+        let pass = image_loss::SsimL1::with(device, std::slice::from_ref(&bands), rows).unwrap();
         let rendered = device.buffer_from("x", &x).unwrap();
         let stack = if weighted { [&y[..], &weights].concat() } else { y.clone() };
         let target = device.buffer_from("y", &stack).unwrap();
         let out = device.buffer::<f32>("gradient", 3 * w * h).unwrap();
         let sums = device.buffer::<f32>("loss", 4).unwrap();
         let mut rec = Recorder::new(device, "ssim");
-        pass.record(&mut rec, &bands.get(0), &rendered, &target, &out, covered, [0.8, 0.2], (&sums, 1));
+        let band = (&bands, &bands.get(0));
+        pass.record(&mut rec, band, &rendered, &target, &out, covered, [0.8, 0.2], (&sums, 1));
         rec.run().unwrap();
         let sums = sums.read().unwrap();
-        let loss = pass.loss([sums[1], sums[2]].map(f64::from), covered);
+        let loss = image_loss::ImageLoss::of(&bands, [sums[1], sums[2]].map(f64::from), covered);
         // Tolerances of src/pass/ssim_l1.rs.
         assert!((loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5);
         let scale = gradient.iter().fold(0.0f64, |m, g| m.max(g.abs()));
