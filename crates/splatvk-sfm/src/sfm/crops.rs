@@ -4,6 +4,7 @@ use super::fit::{IntrinsicsFit, MAX_COST_SHARE, STEPS, fit_intrinsics};
 use super::model::{Model, RefinedIntrinsics};
 use crate::Result;
 use crate::bundle::IntrinsicsPrior;
+use rayon::prelude::*;
 
 /// σ of the principal point offset of a cropped photo, share of its long side: half of the part cut
 /// away.
@@ -15,6 +16,9 @@ const FOCAL_SIGMA: f64 = 0.35;
 /// Least principal point offset of a cropped photo, share of its long side: image stabilisation
 /// moves it by up to 0.02.
 const OFF_CENTRE: f64 = 0.05;
+
+/// Photos of which any two are tried as whole ones: 15 fits.
+const PAIRED: usize = 6;
 
 /// Hypothesis about which photos are whole.
 #[derive(Clone)]
@@ -47,6 +51,25 @@ impl Hypothesis {
         };
         shared.into_iter().chain([view]).map(with_camera).collect()
     }
+
+    /// Hypotheses with two whole views of one camera, among the first [`PAIRED`] of `order`.
+    fn with_two_whole(&self, model: &Model, order: &[usize], usual: &[IntrinsicsPrior]) -> Vec<Hypothesis> {
+        let likely = &order[..order.len().min(PAIRED)];
+        let pairs =
+            likely.iter().enumerate().flat_map(|(k, a)| likely[k + 1..].iter().map(move |b| (*a, *b)));
+        let ids = &model.camera_ids_by_file;
+        pairs
+            .filter(|(a, b)| ids[*a] == ids[*b])
+            .map(|(a, b)| {
+                let mut hypothesis = self.clone();
+                for view in [a, b] {
+                    (hypothesis.camera_ids[view], hypothesis.priors[view]) = (a, usual[view]);
+                    hypothesis.whole[view] = true;
+                }
+                hypothesis
+            })
+            .collect()
+    }
 }
 
 /// The fit, or one with cropped photos if that lowers the cost as much as several cameras must
@@ -75,17 +98,31 @@ pub(super) fn with_crops(best: IntrinsicsFit) -> Result<IntrinsicsFit> {
         priors: usual.iter().enumerate().map(cut).collect(),
         whole: vec![false; views],
     };
-    let mut found = fit_intrinsics(&hypothesis.apply_to(&best.model), refined, STEPS)?;
+    let fit = |start: &Model, tried: &Hypothesis| fit_intrinsics(&tried.apply_to(start), refined, STEPS);
+    let mut found = fit(&best.model, &hypothesis)?;
     if found.bic >= bound {
         return Ok(best);
     }
     // Smallest offsets first: most photos are whole.
     let off = |v: usize| found.model.intrinsics[v].principal_point_offset.length() / found.model.long_side(v);
-    let mut order: Vec<(f64, usize)> = (0..views).map(|v| (off(v), v)).collect();
-    order.sort_by(|a, b| a.0.total_cmp(&b.0));
-    for (_, view) in order {
+    let mut order: Vec<usize> = (0..views).collect();
+    order.sort_by(|a, b| off(*a).total_cmp(&off(*b)));
+    // Four free principal points fit many scenes, so that these offsets may mislead. Two whole
+    // photos with one camera fit the true one only.
+    let pairs = hypothesis.with_two_whole(&found.model, &order, &usual);
+    let pairs: Vec<(IntrinsicsFit, Hypothesis)> =
+        pairs.into_par_iter().map(|tried| Ok((fit(&found.model, &tried)?, tried))).collect::<Result<_>>()?;
+    if let Some((pair, tried)) = pairs.into_iter().min_by(|a, b| a.0.bic.total_cmp(&b.0.bic))
+        && pair.bic < found.bic
+    {
+        (found, hypothesis) = (pair, tried);
+    }
+    for view in order {
+        if hypothesis.whole[view] {
+            continue;
+        }
         for trial in hypothesis.with_whole(&found.model, view, usual[view]) {
-            let fit = fit_intrinsics(&trial.apply_to(&found.model), refined, STEPS)?;
+            let fit = fit(&found.model, &trial)?;
             if fit.bic < found.bic {
                 (found, hypothesis) = (fit, trial);
                 break;
