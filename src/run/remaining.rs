@@ -16,15 +16,29 @@ const TYPICAL_STEPS: f64 = 200.0;
 const PRIOR: f64 = 5.0;
 /// Share of a stage from which only its own pace decides what is left of it.
 const OWN_PACE: f64 = 0.25;
-/// Share of the time of dense stereo that its first tenth takes beyond its part: coarse levels wait
-/// for the device, and the processor finds edges beside.
-const STEREO_START: f64 = 0.2;
+/// Typical seconds by which the networks of the language delay the training beside them.
+const NETWORKS: f64 = 6.5;
 
 /// A stage of the first lane, for which all later ones wait.
 struct Part {
     stage: &'static str,
+    /// Typical seconds of the stage alone.
+    own: f64,
+    /// Seconds by which other work delays it, from its start on with half of the processor.
+    beside: f64,
+}
+
+impl Part {
     /// Typical seconds.
-    seconds: f64,
+    fn seconds(&self) -> f64 {
+        self.own + self.beside
+    }
+
+    /// Share of the time that this share of the steps takes.
+    fn time_share(&self, steps: f64) -> f64 {
+        let own = steps * self.own;
+        (2.0 * own).min(own + self.beside) / self.seconds().max(1e-9)
+    }
 }
 
 /// Size of the work.
@@ -57,10 +71,10 @@ fn parts(work: &Work) -> Vec<Part> {
         ("features", 0.3, 0.1, photos),
         // Each photo is adjusted with those before it; positions are found again on fine photos.
         ("cameras", 3.0, 2.5, photos.powf(1.5) + 2.0 * work.fine as f64 / TYPICAL_PHOTOS),
-        ("dense stereo", 14.0, 0.3, pixels),
-        ("surfaces", 2.6, 1.1, pixels),
-        ("initial splats", 2.0, 0.4, pixels),
-        ("splats", 19.0, 0.3, steps),
+        ("dense stereo", 8.6, 0.3, pixels),
+        ("surfaces", 2.1, 1.1, pixels),
+        ("initial splats", 1.6, 0.4, pixels),
+        ("splats", 16.8, 0.3, steps),
         // Half of the time on photos of shiny things; matt ones skip it.
         ("view dependence", 1.0, 0.2, pixels * view_dependence),
         ("language", 0.7, 0.4, pixels),
@@ -72,7 +86,11 @@ fn parts(work: &Work) -> Vec<Part> {
     let of_language = |stage: &str| ["language", "decode", "query"].contains(&stage);
     list.into_iter()
         .filter(|(stage, ..)| work.language || !of_language(stage))
-        .map(|(stage, cpu, gpu, scale)| Part { stage, seconds: scale * if work.on_cpu { cpu } else { gpu } })
+        .map(|(stage, cpu, gpu, scale)| {
+            let delayed = stage == "splats" && work.on_cpu && work.language;
+            let beside = if delayed { NETWORKS * pixels } else { 0.0 };
+            Part { stage, own: scale * if work.on_cpu { cpu } else { gpu }, beside }
+        })
         .collect()
 }
 
@@ -103,21 +121,12 @@ impl Course {
 
     fn step(&mut self, done: u64, steps: u64) {
         let share = (done as f64 / steps.max(1) as f64).min(1.0);
-        let stage = self.parts.get(self.at).map(|p| p.stage);
-        self.share = self.time_share(stage.unwrap_or_default(), share);
-    }
-
-    /// Share of the time of a stage that this share of its steps takes.
-    fn time_share(&self, stage: &str, steps: f64) -> f64 {
-        match stage {
-            "dense stereo" => STEREO_START * (10.0 * steps).min(1.0) + (1.0 - STEREO_START) * steps,
-            _ => steps,
-        }
+        self.share = self.parts.get(self.at).map_or(share, |part| part.time_share(share));
     }
 
     fn end(&mut self, now: f64) {
         if let (Some(began), Some(part)) = (self.began.take(), self.parts.get(self.at)) {
-            self.finished[0] += part.seconds;
+            self.finished[0] += part.seconds();
             self.finished[1] += now - began;
             self.share = 1.0;
         }
@@ -130,15 +139,15 @@ impl Course {
         // Cameras are the first stage that says something of the machine.
         let known = self.built_in && self.parts.iter().position(|p| p.stage == "cameras") <= Some(self.at);
         let running = if self.began.is_some() { self.share } else { 0.0 };
-        let typical = self.finished[0] + running * current.seconds;
+        let typical = self.finished[0] + running * current.seconds();
         let true_seconds = self.finished[1] + if running > 0.0 { elapsed } else { 0.0 };
         let pace = (PRIOR + true_seconds) / (PRIOR + typical);
         let trust = (self.share / OWN_PACE).min(1.0);
         let own = elapsed * (1.0 - self.share) / self.share.max(1e-9);
         // A stage that overruns is nearly done.
-        let usual = (pace * current.seconds - elapsed).max(0.0) * (1.0 - trust);
+        let usual = (pace * current.seconds() - elapsed).max(0.0) * (1.0 - trust);
         let rest = if self.share > 0.0 { trust * own + usual } else { usual };
-        let later: f64 = self.parts[self.at + 1..].iter().map(|p| p.seconds).sum();
+        let later: f64 = self.parts[self.at + 1..].iter().map(Part::seconds).sum();
         Some(Overall {
             stage: self.at + 1,
             stages: self.parts.len(),
@@ -231,40 +240,45 @@ mod tests {
     /// megapixels at 600 × 800.
     const RUNS: [(f64, [usize; 2], &[Measured]); 2] = [
         (
-            44.8,
+            41.8,
             [0, 4 * 640 * 480],
             &[
-                ("photos", 0.8, 0.0, &[]),
-                ("features", 1.0, 0.1, &[]),
-                ("cameras", 1.1, 3.0, &[]),
-                ("dense stereo", 4.2, 14.1, &[(0.12, 2.8), (0.33, 6.4), (0.62, 10.3), (0.998, 14.1)]),
-                ("surfaces", 18.3, 2.6, &[]),
-                ("initial splats", 20.9, 2.2, &[]),
-                ("splats", 23.1, 19.1, &[(0.02, 0.7), (0.12, 2.4), (0.33, 6.3), (0.52, 9.9), (0.95, 17.8)]),
-                ("language", 42.2, 0.7, &[]),
-                ("decode", 43.0, 0.7, &[]),
-                ("query", 43.7, 0.1, &[]),
-                ("seen", 43.8, 0.3, &[]),
-                ("write", 44.1, 0.6, &[]),
+                ("photos", 0.1, 0.0, &[]),
+                ("features", 0.3, 0.1, &[]),
+                ("cameras", 0.5, 2.9, &[]),
+                ("dense stereo", 3.4, 8.6, &[(0.12, 1.3), (0.33, 3.0), (0.62, 5.2), (0.998, 8.6)]),
+                ("surfaces", 12.1, 1.8, &[]),
+                ("initial splats", 13.9, 1.5, &[]),
+                ("splats", 15.4, 24.0, &[(0.09, 3.0), (0.24, 9.0), (0.41, 13.3), (0.65, 17.4), (0.96, 23.0)]),
+                ("language", 39.5, 0.7, &[]),
+                ("decode", 40.2, 0.7, &[]),
+                ("query", 40.9, 0.1, &[]),
+                ("seen", 40.9, 0.3, &[]),
+                ("write", 41.3, 0.5, &[]),
             ],
         ),
         (
-            74.7,
+            74.0,
             [4, 4 * 600 * 800],
             &[
                 ("photos", 0.1, 1.8, &[]),
                 ("features", 2.1, 0.2, &[]),
-                ("cameras", 2.3, 9.4, &[]),
-                ("dense stereo", 12.0, 20.8, &[(0.12, 4.4), (0.33, 9.9), (0.62, 15.2), (0.998, 20.8)]),
-                ("surfaces", 32.8, 4.5, &[]),
-                ("initial splats", 37.3, 2.4, &[]),
-                ("splats", 39.6, 27.8, &[(0.02, 1.6), (0.12, 5.7), (0.33, 11.3), (0.52, 16.1), (0.95, 26.1)]),
-                ("view dependence", 67.5, 3.1, &[]),
-                ("language", 70.6, 1.4, &[]),
-                ("decode", 72.0, 1.1, &[]),
-                ("query", 73.1, 0.2, &[]),
-                ("seen", 73.2, 0.4, &[]),
-                ("write", 73.7, 0.9, &[]),
+                ("cameras", 2.3, 9.7, &[]),
+                ("dense stereo", 12.3, 13.2, &[(0.12, 2.1), (0.33, 4.6), (0.62, 8.2), (1.0, 13.2)]),
+                ("surfaces", 25.5, 3.7, &[]),
+                ("initial splats", 29.2, 2.7, &[]),
+                (
+                    "splats",
+                    31.8,
+                    35.1,
+                    &[(0.09, 4.5), (0.24, 13.0), (0.41, 19.9), (0.65, 26.1), (0.96, 33.8)],
+                ),
+                ("view dependence", 67.0, 2.9, &[]),
+                ("language", 70.0, 1.4, &[]),
+                ("decode", 71.4, 1.1, &[]),
+                ("query", 72.5, 0.2, &[]),
+                ("seen", 72.6, 0.4, &[]),
+                ("write", 73.1, 0.9, &[]),
             ],
         ),
     ];
