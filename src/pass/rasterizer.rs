@@ -41,7 +41,7 @@
 use super::bands::{Band, Bands};
 use super::channels::BASE_CHANNELS;
 use super::frame::{
-    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, GradientReduction, PROJECTED_FLOATS, TileSums, Tiles,
+    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, GradientReduction, PROJECTED_FLOATS, Tiles,
     entry_bytes,
 };
 use super::fused_update::{self, SplatAdam};
@@ -56,37 +56,10 @@ use crate::gpu::{Buffer, Device, Recorder};
 use crate::{Error, Result};
 use std::ops::Range;
 
+pub use super::choices::DeviceChoices;
 pub use super::frame::FrameBuffers;
 pub use super::options::RasterOptions;
 pub use super::splat_buffers::SplatBuffers;
-
-/// Choices among kernel variants that compute the same.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct DeviceChoices {
-    /// Binning of the tile lists.
-    pub grouping: TileBinning,
-    /// Reduction of the gradients over tiles.
-    pub summation: GradientReduction,
-    /// Reduction of the gradients over the pixels of a tile.
-    pub tile_sums: TileSums,
-    /// Writing of the gradients by the SH coefficients.
-    pub sh_gradients: ShGradientKernel,
-    /// Most workgroups of the backward pass of the projection.
-    pub projection_groups: u32,
-}
-
-impl DeviceChoices {
-    /// Fastest choices for the device.
-    pub fn of(device: &Device) -> DeviceChoices {
-        DeviceChoices {
-            grouping: TileBinning::of(device),
-            summation: GradientReduction::of(device),
-            tile_sums: TileSums::of(device),
-            sh_gradients: ShGradientKernel::of(device),
-            projection_groups: project_backward::most_groups(device),
-        }
-    }
-}
 
 /// Most tile-list entries that the device holds at once, including the gradients per entry of
 /// [`GradientReduction::Entries`].
