@@ -369,6 +369,26 @@ mod tests {
         let others = with_faces.confidence[WIDTH * HEIGHT..].iter().filter(|c| **c == INFERRED).count();
         assert_eq!(others, 0);
     }
+
+    #[test]
+    fn refutes_surface_of_another_colour() {
+        let (cameras, mut level, known) = box_scene();
+        let poses = RelativePoses::new(&level);
+        // Pixels whose wall another view shows, too.
+        let wall: Vec<usize> = (0..WIDTH * HEIGHT)
+            .filter(|k| known.confidence[*k] > 0.0 && hit(&cameras[0], pixel_centre(*k)).0.z > 3.9)
+            .collect();
+        let refuted = |level: &Level| {
+            let view = View::new(level, &poses, &known, &known, 0);
+            wall.iter().filter(|k| view.refutes(**k, Vec3::Z / 4.0)).count()
+        };
+        let green = refuted(&level);
+        wall.iter().for_each(|k| level.guide[0].data[*k] = [0.7, 0.2, 0.2]);
+        let red = refuted(&level);
+        println!("of {}: {green} with their colour, {red} in red", wall.len());
+        assert!(20 * green < wall.len() && 2 * red > wall.len());
+    }
+
     #[test]
     fn rim_of_own_colour_weighs_more() {
         let (cameras, level, known) = box_scene();
