@@ -193,10 +193,10 @@ impl SsimL1 {
         })
     }
 
-    /// Records the pass for one of `bands`. `rendered` and `gradient` are planar `[≥3, rows, W]` stacks
-    /// with RGB first, `target` is `[3, rows, W]`. With `covered`, the sum of the pixel weights of
-    /// the whole image, `target` is `[4, rows, W]`, the last plane the weights. Writes Σ|x−y| of
-    /// the band to `loss[slot]` and, unless its weight is 0, ΣSSIM to `loss[slot+1]`: see
+    /// Records the pass for one of `bands`. `rendered` and `gradient` are planar `[≥3, rows, W]`,
+    /// RGB first; `target` is `[3, rows, W]`. With `covered`, the sum of the pixel weights of the
+    /// whole image, `target` is `[4, rows, W]`, the last plane the weights. Writes Σ|x−y| of the
+    /// band to `loss[slot]` and, unless its weight is 0, ΣSSIM to `loss[slot+1]`: see
     /// [`ImageLoss::of`]. `weights` are those of L1 and 1 − SSIM.
     pub fn record(
         &self,

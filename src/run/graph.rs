@@ -186,8 +186,8 @@ impl ScenePlan<'_> {
         language.map(|l| sources::make::<FeatureSources>(&l.features, registry, registry)).transpose()
     }
 
-    /// On a CPU device the networks of the language wait for the geometry, so that the first picture
-    /// is there sooner: training has time for them beside it.
+    /// On a CPU device the networks of the language wait for the geometry: the first picture is there
+    /// sooner, and training has time for them beside it.
     fn share_processor(&mut self, geometry: Output<pose::Geometry>) {
         if self.device.info().is_cpu {
             self.build.graph.after(geometry);

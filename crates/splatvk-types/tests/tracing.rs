@@ -1,5 +1,5 @@
-//! Events of `tracing`. A process of its own: a callsite that another test reaches first, on a thread
-//! without a subscriber, would stay disabled.
+//! Events of `tracing`. A process of its own: a callsite that another test reaches first, on a
+//! thread without a subscriber, would stay disabled.
 #![allow(clippy::unwrap_used)] // helpers of tests
 use splatvk_types::progress::{Progress, Recorded, Silent};
 use std::sync::{Arc, Mutex};
