@@ -2,8 +2,8 @@
 use crate::executor::{Change, Interpreted};
 use crate::passes::{self, Scene};
 use crate::{interpreted, outcome};
-use spirv::Op;
 use spirv_interpreter::module::{Instruction, assemble, instructions};
+use spirv_interpreter::spirv::Op;
 use spirv_interpreter::{Order, words as words_of};
 use splatvk::gpu::{Module, shaders};
 use std::sync::Arc;
@@ -147,7 +147,7 @@ fn nonatomic_addition_is_race() {
 fn divergent_subgroup_operation_is_reported() {
     // Loops end where the counter reaches the lane.
     let change = family_change("raster_forward", |list, _| {
-        let built_in = spirv::BuiltIn::SubgroupLocalInvocationId as u32;
+        let built_in = spirv_interpreter::spirv::BuiltIn::SubgroupLocalInvocationId as u32;
         let decorates = |i: &&Instruction| i.op == Op::Decorate && i.words.get(2) == Some(&built_in);
         let variable = list.iter().find(decorates).expect("the lane").words[0];
         let lane =
@@ -238,7 +238,7 @@ fn number_by_workgroup(list: &mut Vec<Instruction>, free: u32) {
     let vector =
         list.iter().find(|i| i.op == Op::TypeVector && i.words[2] == 3).expect("uvec3").words.clone();
     let (vector, scalar) = (vector[0], vector[1]);
-    let input = spirv::StorageClass::Input as u32;
+    let input = spirv_interpreter::spirv::StorageClass::Input as u32;
     let pointer_to = |ty: u32| {
         let fits = |i: &&Instruction| i.op == Op::TypePointer && i.words[1..] == [input, ty];
         list.iter().find(fits).expect("a pointer").words[0]
@@ -254,7 +254,11 @@ fn number_by_workgroup(list: &mut Vec<Instruction>, free: u32) {
     list.splice(at..=at, number);
     let function = list.iter().position(|i| i.op == Op::Function).expect("a function");
     list.insert(function, instruction(Op::Variable, &[to_vector, variable, input]));
-    let built_in = [variable, spirv::Decoration::BuiltIn as u32, spirv::BuiltIn::WorkgroupId as u32];
+    let built_in = [
+        variable,
+        spirv_interpreter::spirv::Decoration::BuiltIn as u32,
+        spirv_interpreter::spirv::BuiltIn::WorkgroupId as u32,
+    ];
     list.insert(0, instruction(Op::Decorate, &built_in));
 }
 

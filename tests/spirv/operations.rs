@@ -3,8 +3,8 @@
 use crate::executor::{Change, Interpreted};
 use crate::passes::{self, Scene};
 use crate::{interpreted, outcome};
-use spirv::Op;
 use spirv_interpreter::module::{Instruction, assemble, instructions};
+use spirv_interpreter::spirv::Op;
 use spirv_interpreter::{Random, words as words_of};
 use splatvk::gpu::{Module, shaders};
 use std::sync::Arc;

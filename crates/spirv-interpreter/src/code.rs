@@ -3,7 +3,7 @@
 //! A register holds one 32-bit word for every invocation of a subgroup. A vector, a matrix or a
 //! structure is a list of registers, so extracting and composing parts costs nothing. Booleans are
 //! 0 or 1.
-use spirv::BuiltIn;
+use rspirv::spirv::BuiltIn;
 
 pub type Reg = u32;
 

@@ -4,7 +4,7 @@ use crate::code::Code;
 use crate::faults::Faults;
 use crate::memory::Memory;
 use crate::subgroup::{Dispatch, Group, Stop, Subgroup};
-use spirv::MemorySemantics;
+use rspirv::spirv::MemorySemantics;
 
 /// Order in which workgroups begin.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -58,6 +58,7 @@ pub use code::GARBAGE;
 pub use dispatch::{Order, Random, Schedule};
 pub use faults::{Error, Fault, Found};
 pub use memory::Memory;
+pub use rspirv::spirv;
 
 /// Little-endian words of a SPIR-V file or a buffer.
 pub fn words(bytes: &[u8]) -> Vec<u32> {

@@ -5,7 +5,7 @@ use crate::code::{
 };
 use crate::module::{Instruction, Module};
 use crate::types::Type;
-use spirv::{BuiltIn, GroupOperation, Op, StorageClass};
+use rspirv::spirv::{BuiltIn, GroupOperation, Op, StorageClass};
 use std::collections::{HashMap, HashSet};
 
 pub struct Lowering {
@@ -237,7 +237,7 @@ impl Lowering {
             // workgroup only.
             Op::ControlBarrier => {
                 let scope = self.constant_value(w[0]);
-                assert_eq!(scope, spirv::Scope::Workgroup as u32, "a barrier of a workgroup");
+                assert_eq!(scope, rspirv::spirv::Scope::Workgroup as u32, "a barrier of a workgroup");
                 self.push(Inst::Barrier { semantics: self.constant_value(w[2]) });
             }
             _ if self.atomic(i) || self.subgroup(i) || self.alu(i) => {}

@@ -2,7 +2,7 @@
 use crate::code::{Binary, GARBAGE, Inst, Reg, Unary};
 use crate::lower::Lowering;
 use crate::module::Instruction;
-use spirv::{GlslStd450Op as GLOp, Op};
+use rspirv::spirv::{GlslStd450Op as GLOp, Op};
 
 impl Lowering {
     pub fn alu(&mut self, i: &Instruction) -> bool {

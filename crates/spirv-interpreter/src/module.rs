@@ -1,6 +1,7 @@
 //! A module as a list of instructions that can be modified and reassembled.
 use crate::types::{Type, Types};
-use spirv::{Decoration, ExecutionMode, Op, StorageClass};
+use rspirv::binary::Assemble;
+use rspirv::spirv::{Decoration, ExecutionMode, Op, StorageClass};
 use std::collections::HashMap;
 
 /// One instruction.
@@ -17,16 +18,17 @@ pub struct Instruction {
 /// The instructions of a module, without its header.
 ///
 /// # Panics
-/// If an opcode is unknown.
+/// If it is no module of the SPIR-V version that rspirv reads.
 pub fn instructions(words: &[u32]) -> Vec<Instruction> {
-    let (mut out, mut at) = (Vec::new(), 5);
-    while at < words.len() {
-        let length = (words[at] >> 16) as usize;
-        let op = Op::from_u32(words[at] & 0xFFFF).expect("an opcode");
-        out.push(Instruction { op, words: words[at + 1..at + length].to_vec(), at: at as u32 });
-        at += length;
-    }
-    out
+    let module = rspirv::dr::load_words(words).unwrap_or_else(|e| panic!("a module: {e}"));
+    let mut at = 5;
+    let list = module.all_inst_iter().map(|i| {
+        let words = i.assemble();
+        let begin = at;
+        at += words.len() as u32;
+        Instruction { op: i.class.opcode, words: words[1..].to_vec(), at: begin }
+    });
+    list.collect()
 }
 
 /// Words of a module: the header of another one, and these instructions.

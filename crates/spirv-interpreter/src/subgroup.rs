@@ -5,7 +5,7 @@ use crate::alu;
 use crate::code::{Code, Edge, End, GARBAGE, Inst, Place, Reg, Root, Step};
 use crate::faults::{Fault, Faults};
 use crate::memory::{Accessor, Memory};
-use spirv::BuiltIn;
+use rspirv::spirv::BuiltIn;
 
 /// Marks a pointer out of bounds; the other bits are the index.
 pub const OUT_OF_BOUNDS: u32 = 1 << 31;

@@ -1,5 +1,5 @@
 //! Types of a module: number of scalars of a value, and their layout in memory.
-use spirv::{Decoration, Op, StorageClass};
+use rspirv::spirv::{Decoration, Op, StorageClass};
 use std::collections::HashMap;
 
 /// A type, by the ids of its parts.

@@ -66,7 +66,7 @@ fn results_are_independent_of_schedule() {
 fn removed_barrier_is_race() {
     let spirv = compiled(SUM_OF_WORKGROUP);
     let mut list = instructions(&spirv);
-    list.retain(|i| i.op != spirv::Op::ControlBarrier);
+    list.retain(|i| i.op != spirv_interpreter::spirv::Op::ControlBarrier);
     let error = run(&assemble(&spirv, &list), Memory::of(vec![0; 64]), 1, &SCHEDULE).unwrap_err();
     let Error::Faulty(found) = &error else { panic!("{error}") };
     assert!(found.iter().any(|f| f.fault == Fault::Race), "{error}");

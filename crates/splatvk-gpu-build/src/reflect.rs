@@ -1,6 +1,7 @@
 //! Reflection of SPIR-V: storage buffers with their access, push constants, workgroup size,
-//! capabilities. An unsupported feature is an error that names it. Opcodes and enumerants are those
-//! of the SPIR-V specification 1.5 and its extension registry.
+//! capabilities. An unsupported feature is an error that names it.
+use rspirv::binary::Assemble;
+use rspirv::spirv::{self, Decoration, ExecutionMode, Op, StorageClass};
 use std::collections::{BTreeMap, HashMap};
 
 /// How a module touches one storage buffer.
@@ -73,25 +74,52 @@ pub struct Reflection {
     pub capabilities: Vec<&'static str>,
 }
 
-/// SPIR-V capability number → variant of `splatvk_gpu::Capability`; `None` for those that every
-/// Vulkan 1.2 device has.
-const CAPABILITIES: &[(u32, Option<&str>)] = &[
-    (1, None), // Shader
-    (9, Some("Float16")),
-    (10, Some("Float64")),
-    (11, Some("Int64")),
-    (22, Some("Int16")),
-    (39, Some("Int8")),
-    (61, Some("SubgroupBasic")),
-    (62, Some("SubgroupVote")),
-    (63, Some("SubgroupArithmetic")),
-    (64, Some("SubgroupBallot")),
-    (65, Some("SubgroupShuffle")),
-    (66, Some("SubgroupShuffleRelative")),
-    (4433, Some("Storage16")),
-    (4448, Some("Storage8")),
-    (6033, Some("AtomicFloatAdd")),
-];
+/// Name of the `splatvk_gpu::Capability`; `Some(None)` for those that every Vulkan 1.2 device has.
+fn capability(number: u32) -> Option<Option<&'static str>> {
+    use spirv::Capability as C;
+    Some(Some(match C::from_u32(number)? {
+        C::Shader => return Some(None),
+        C::Float16 => "Float16",
+        C::Float64 => "Float64",
+        C::Int64 => "Int64",
+        C::Int16 => "Int16",
+        C::Int8 => "Int8",
+        C::GroupNonUniform => "SubgroupBasic",
+        C::GroupNonUniformVote => "SubgroupVote",
+        C::GroupNonUniformArithmetic => "SubgroupArithmetic",
+        C::GroupNonUniformBallot => "SubgroupBallot",
+        C::GroupNonUniformShuffle => "SubgroupShuffle",
+        C::GroupNonUniformShuffleRelative => "SubgroupShuffleRelative",
+        C::StorageBuffer16BitAccess => "Storage16",
+        C::StorageBuffer8BitAccess => "Storage8",
+        C::AtomicFloat32AddEXT => "AtomicFloatAdd",
+        _ => return None,
+    }))
+}
+
+/// Whether an atomic instruction reads and writes its pointer, operand 2.
+fn is_atomic_update(op: Op) -> bool {
+    matches!(
+        op,
+        Op::AtomicExchange
+            | Op::AtomicCompareExchange
+            | Op::AtomicCompareExchangeWeak
+            | Op::AtomicIIncrement
+            | Op::AtomicIDecrement
+            | Op::AtomicIAdd
+            | Op::AtomicISub
+            | Op::AtomicSMin
+            | Op::AtomicUMin
+            | Op::AtomicSMax
+            | Op::AtomicUMax
+            | Op::AtomicAnd
+            | Op::AtomicOr
+            | Op::AtomicXor
+            | Op::AtomicFAddEXT
+            | Op::AtomicFMinEXT
+            | Op::AtomicFMaxEXT
+    )
+}
 
 enum Type {
     Scalar(Scalar),
@@ -108,43 +136,34 @@ enum Type {
 struct Reader {
     names: HashMap<u32, String>,
     member_names: HashMap<(u32, u32), String>,
-    decorations: HashMap<(u32, u32), u32>,
-    member_decorations: HashMap<(u32, u32, u32), u32>,
+    decorations: HashMap<(u32, Decoration), u32>,
+    member_decorations: HashMap<(u32, u32, Decoration), u32>,
     types: HashMap<u32, Type>,
     constants: HashMap<u32, u32>,
     /// Variable id → (storage class, pointer type).
-    variables: BTreeMap<u32, (u32, u32)>,
+    variables: BTreeMap<u32, (StorageClass, u32)>,
     /// Pointer id → the variable it leads into.
     roots: HashMap<u32, u32>,
     used: HashMap<u32, Access>,
     out: Reflection,
 }
 
-const BUILT_IN: u32 = 11;
-const NON_WRITABLE: u32 = 24;
-const NON_READABLE: u32 = 25;
-const ARRAY_STRIDE: u32 = 6;
-const MATRIX_STRIDE: u32 = 7;
-const BINDING: u32 = 33;
-const DESCRIPTOR_SET: u32 = 34;
-const OFFSET: u32 = 35;
-const STORAGE_PUSH_CONSTANT: u32 = 9;
-const STORAGE_BUFFER: u32 = 12;
-
 /// Reads one unoptimised module.
 pub fn reflect(words: &[u32]) -> Result<Reflection, String> {
-    if words.first() != Some(&0x0723_0203) {
-        return Err("not a SPIR-V module".into());
-    }
+    let module = rspirv::dr::load_words(words).map_err(|e| format!("not a SPIR-V module: {e}"))?;
     let mut reader = Reader::default();
-    let mut at = 5;
-    while at < words.len() {
-        let (length, opcode) = ((words[at] >> 16) as usize, words[at] & 0xffff);
-        let operands = words.get(at + 1..at + length).filter(|_| length > 0).ok_or("truncated SPIR-V")?;
-        reader.instruction(opcode, operands)?;
-        at += length;
+    for instruction in module.all_inst_iter() {
+        reader.instruction(instruction.class.opcode, &instruction.assemble()[1..])?;
     }
     reader.finish()
+}
+
+fn decoration(number: u32) -> Result<Decoration, String> {
+    Decoration::from_u32(number).ok_or_else(|| format!("decoration {number} is unknown"))
+}
+
+fn storage_class(number: u32) -> Result<StorageClass, String> {
+    StorageClass::from_u32(number).ok_or_else(|| format!("storage class {number} is unknown"))
 }
 
 fn text(words: &[u32]) -> String {
@@ -153,59 +172,74 @@ fn text(words: &[u32]) -> String {
 }
 
 impl Reader {
-    fn instruction(&mut self, opcode: u32, o: &[u32]) -> Result<(), String> {
-        match opcode {
-            5 => drop(self.names.insert(o[0], text(&o[1..]))),
-            6 => drop(self.member_names.insert((o[0], o[1]), text(&o[2..]))),
-            16 if o[1] == 17 => self.out.workgroup = [o[2], o[3], o[4]],
-            17 => self.capability(o[0])?,
-            21 if o[1] == 32 => {
+    fn instruction(&mut self, op: Op, o: &[u32]) -> Result<(), String> {
+        match op {
+            Op::Name => drop(self.names.insert(o[0], text(&o[1..]))),
+            Op::MemberName => drop(self.member_names.insert((o[0], o[1]), text(&o[2..]))),
+            Op::ExecutionMode if o[1] == ExecutionMode::LocalSize as u32 => {
+                self.out.workgroup = [o[2], o[3], o[4]]
+            }
+            Op::Capability => self.capability(o[0])?,
+            Op::TypeInt if o[1] == 32 => {
                 let scalar = if o[2] == 0 { Scalar::U32 } else { Scalar::I32 };
                 self.types.insert(o[0], Type::Scalar(scalar));
             }
-            22 if o[1] == 32 => drop(self.types.insert(o[0], Type::Scalar(Scalar::F32))),
-            29 => drop(self.types.insert(o[0], Type::RuntimeArray(o[1]))),
-            21 | 22 => drop(self.types.insert(o[0], Type::Other)),
-            23 => drop(self.types.insert(o[0], Type::Vector(o[1], o[2]))),
-            24 => drop(self.types.insert(o[0], Type::Matrix(o[1], o[2]))),
-            28 => drop(self.types.insert(o[0], Type::Array(o[1], o[2]))),
-            30 => drop(self.types.insert(o[0], Type::Struct(o[1..].to_vec()))),
-            32 => drop(self.types.insert(o[0], Type::Pointer(o[2]))),
-            43 => drop(self.constants.insert(o[1], o[2])),
-            48..=52 => return Err("specialisation constants are not supported: use `// variants:`".into()),
-            59 => {
-                self.variables.insert(o[1], (o[2], o[0]));
+            Op::TypeFloat if o[1] == 32 => drop(self.types.insert(o[0], Type::Scalar(Scalar::F32))),
+            Op::TypeRuntimeArray => drop(self.types.insert(o[0], Type::RuntimeArray(o[1]))),
+            Op::TypeInt | Op::TypeFloat => drop(self.types.insert(o[0], Type::Other)),
+            Op::TypeVector => drop(self.types.insert(o[0], Type::Vector(o[1], o[2]))),
+            Op::TypeMatrix => drop(self.types.insert(o[0], Type::Matrix(o[1], o[2]))),
+            Op::TypeArray => drop(self.types.insert(o[0], Type::Array(o[1], o[2]))),
+            Op::TypeStruct => drop(self.types.insert(o[0], Type::Struct(o[1..].to_vec()))),
+            Op::TypePointer => drop(self.types.insert(o[0], Type::Pointer(o[2]))),
+            Op::Constant => drop(self.constants.insert(o[1], o[2])),
+            Op::SpecConstantTrue
+            | Op::SpecConstantFalse
+            | Op::SpecConstant
+            | Op::SpecConstantComposite
+            | Op::SpecConstantOp => {
+                return Err("specialisation constants are not supported: use `// variants:`".into());
+            }
+            Op::Variable => {
+                self.variables.insert(o[1], (storage_class(o[2])?, o[0]));
                 self.roots.insert(o[1], o[1]);
             }
-            71 => drop(self.decorations.insert((o[0], o[1]), o.get(2).copied().unwrap_or(0))),
-            72 => drop(self.member_decorations.insert((o[0], o[1], o[2]), o.get(3).copied().unwrap_or(0))),
-            _ => self.access(opcode, o),
+            Op::Decorate => {
+                let key = (o[0], decoration(o[1])?);
+                self.decorations.insert(key, o.get(2).copied().unwrap_or(0));
+            }
+            Op::MemberDecorate => {
+                let key = (o[0], o[1], decoration(o[2])?);
+                self.member_decorations.insert(key, o.get(3).copied().unwrap_or(0));
+            }
+            _ => self.access(op, o),
         }
         Ok(())
     }
 
     /// Follows pointers to their variables and records the accesses.
-    fn access(&mut self, opcode: u32, o: &[u32]) {
+    fn access(&mut self, op: Op, o: &[u32]) {
         const READ: Access = Access { read: true, write: false };
         const WRITE: Access = Access { read: false, write: true };
         const BOTH: Access = Access { read: true, write: true };
-        match opcode {
-            61 | 227 => self.touch(o[2], READ),  // OpLoad, OpAtomicLoad
-            62 | 228 => self.touch(o[0], WRITE), // OpStore, OpAtomicStore
-            63 => {
+        match op {
+            Op::Load | Op::AtomicLoad => self.touch(o[2], READ),
+            Op::Store | Op::AtomicStore => self.touch(o[0], WRITE),
+            Op::CopyMemory => {
                 self.touch(o[0], WRITE);
                 self.touch(o[1], READ);
             }
-            65 | 66 => {
+            Op::AccessChain | Op::InBoundsAccessChain => {
                 if let Some(&root) = self.roots.get(&o[2]) {
                     self.roots.insert(o[1], root);
                 }
             }
-            68 => {} // OpArrayLength reads the descriptor, not the memory.
-            229..=242 | 6035 | 5614 | 5615 => self.touch(o[2], BOTH),
-            // OpFunctionCall, OpCopyObject, OpSelect, OpPhi: a pointer handed on may be used for
-            // anything.
-            57 | 83 | 169 | 245 => o[2..].iter().for_each(|&id| self.touch(id, BOTH)),
+            Op::ArrayLength => {} // It reads the descriptor, not the memory.
+            op if is_atomic_update(op) => self.touch(o[2], BOTH),
+            // A pointer that is handed on may be used for anything.
+            Op::FunctionCall | Op::CopyObject | Op::Select | Op::Phi => {
+                o[2..].iter().for_each(|&id| self.touch(id, BOTH))
+            }
             _ => {}
         }
     }
@@ -219,35 +253,34 @@ impl Reader {
     }
 
     fn capability(&mut self, number: u32) -> Result<(), String> {
-        match CAPABILITIES.iter().find(|(n, _)| *n == number) {
-            Some((_, Some(name))) => self.out.capabilities.push(name),
-            Some((_, None)) => {}
-            None => {
-                return Err(format!("SPIR-V capability {number} is not supported"));
-            }
-        }
-        Ok(())
+        let known = capability(number);
+        self.out.capabilities.extend(known.flatten());
+        let name = || spirv::Capability::from_u32(number).map_or(number.to_string(), |c| format!("{c:?}"));
+        known.map(drop).ok_or_else(|| format!("SPIR-V capability {} is not supported", name()))
     }
 
     fn finish(mut self) -> Result<Reflection, String> {
-        let variables: Vec<(u32, (u32, u32))> = self.variables.iter().map(|(&i, &v)| (i, v)).collect();
+        let variables: Vec<(u32, (StorageClass, u32))> =
+            self.variables.iter().map(|(&i, &v)| (i, v)).collect();
         for (id, (class, pointer)) in variables {
             let Some(&Type::Pointer(pointee)) = self.types.get(&pointer) else { continue };
             match class {
-                STORAGE_BUFFER => {
+                StorageClass::StorageBuffer => {
                     let binding = self.binding(id, pointee)?;
                     self.out.bindings.push(binding);
                     if let Some(layout) = self.layout(pointee)? {
                         self.out.layouts.push(layout);
                     }
                 }
-                STORAGE_PUSH_CONSTANT => self.push(pointee)?,
-                0 | 2 => {
+                StorageClass::PushConstant => self.push(pointee)?,
+                StorageClass::UniformConstant | StorageClass::Uniform => {
                     let name = self.names.get(&pointee).cloned().unwrap_or_default();
                     return Err(format!("`{name}`: only storage buffers and push constants are supported"));
                 }
                 // Input (built-ins), Output, Workgroup, Private, Function: invisible from the host.
-                _ => debug_assert!(class != 1 || self.decorations.contains_key(&(id, BUILT_IN))),
+                _ => debug_assert!(
+                    class != StorageClass::Input || self.decorations.contains_key(&(id, Decoration::BuiltIn))
+                ),
             }
         }
         self.out.bindings.sort_by_key(|b| b.number);
@@ -268,21 +301,24 @@ impl Reader {
         let Some(Type::Struct(members)) = self.types.get(&block) else {
             return Err(format!("`{name}`: arrays of buffers are not supported"));
         };
-        if self.decorations.get(&(id, DESCRIPTOR_SET)).is_some_and(|&s| s != 0) {
+        if self.decorations.get(&(id, Decoration::DescriptorSet)).is_some_and(|&s| s != 0) {
             return Err(format!("`{name}`: only descriptor set 0 is supported"));
         }
-        let number =
-            *self.decorations.get(&(id, BINDING)).ok_or_else(|| format!("`{name}` has no binding number"))?;
-        let declared = |what: u32| {
-            self.decorations.contains_key(&(id, what))
-                || (0..members.len() as u32).all(|m| self.member_decorations.contains_key(&(block, m, what)))
+        let number = *self
+            .decorations
+            .get(&(id, Decoration::Binding))
+            .ok_or_else(|| format!("`{name}` has no binding number"))?;
+        let declared = |promise: Decoration| {
+            self.decorations.contains_key(&(id, promise))
+                || (0..members.len() as u32)
+                    .all(|m| self.member_decorations.contains_key(&(block, m, promise)))
         };
         // `readonly` / `writeonly` are promises the GLSL compiler enforces; what the code does is
         // the finer truth.
         let used = self.used.get(&id).copied().unwrap_or_default();
         let access = Access {
-            read: used.read && !declared(NON_READABLE),
-            write: used.write && !declared(NON_WRITABLE),
+            read: used.read && !declared(Decoration::NonReadable),
+            write: used.write && !declared(Decoration::NonWritable),
         };
         let &[member] = members.as_slice() else {
             return Err(format!(
@@ -313,7 +349,9 @@ impl Reader {
         let Some(Type::Struct(block_members)) = self.types.get(&block) else { return Ok(None) };
         let &[member] = block_members.as_slice() else { return Ok(None) };
         let (id, stride) = match self.types.get(&member) {
-            Some(&Type::RuntimeArray(element)) => (element, self.decorations.get(&(member, ARRAY_STRIDE))),
+            Some(&Type::RuntimeArray(element)) => {
+                (element, self.decorations.get(&(member, Decoration::ArrayStride)))
+            }
             _ => (member, None),
         };
         let Some(Type::Struct(members)) = self.types.get(&id) else { return Ok(None) };
@@ -322,7 +360,7 @@ impl Reader {
         for (index, &kind) in members.iter().enumerate() {
             let index = index as u32;
             let member_name = self.member_names.get(&(id, index)).cloned().unwrap_or_default();
-            let offset = self.member_decorations.get(&(id, index, OFFSET)).copied().unwrap_or(0);
+            let offset = self.member_decorations.get(&(id, index, Decoration::Offset)).copied().unwrap_or(0);
             let member = self.member(id, index, kind, member_name.clone(), offset).ok_or_else(|| {
                 format!("`{name}.{member_name}`: a structure holds scalars, vectors and arrays of them")
             })?;
@@ -351,7 +389,8 @@ impl Reader {
         for (index, &kind) in members.iter().enumerate() {
             let index = index as u32;
             let name = self.member_names.get(&(block, index)).cloned().unwrap_or_default();
-            let offset = self.member_decorations.get(&(block, index, OFFSET)).copied().unwrap_or(0);
+            let offset =
+                self.member_decorations.get(&(block, index, Decoration::Offset)).copied().unwrap_or(0);
             let member = self.member(block, index, kind, name.clone(), offset).ok_or_else(|| {
                 format!("push constant `{name}`: use int, uint, float, vectors, matrices or arrays of them")
             })?;
@@ -371,12 +410,16 @@ impl Reader {
         let mut kind = kind;
         let mut array = None;
         if let Some(Type::Array(element, length)) = self.types.get(&kind) {
-            array = Some((*self.constants.get(length)?, *self.decorations.get(&(kind, ARRAY_STRIDE))?));
+            array = Some((
+                *self.constants.get(length)?,
+                *self.decorations.get(&(kind, Decoration::ArrayStride))?,
+            ));
             kind = *element;
         }
         let mut columns = None;
         if let Some(Type::Matrix(column, count)) = self.types.get(&kind) {
-            columns = Some((*count, *self.member_decorations.get(&(block, index, MATRIX_STRIDE))?));
+            columns =
+                Some((*count, *self.member_decorations.get(&(block, index, Decoration::MatrixStride))?));
             kind = *column;
         }
         let mut rows = 1;
