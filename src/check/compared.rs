@@ -38,3 +38,15 @@ pub(super) fn equal<T: PartialEq + std::fmt::Debug>(
         Some(i) => Err(format!("{what}: element {i} is {:?}, should be {:?}", actual[i], reference[i])),
     }
 }
+
+/// Repeats a check for several cases; returns the first mismatch, or the last result.
+pub(super) fn each<T>(cases: impl IntoIterator<Item = T>, mut check: impl FnMut(T) -> Found) -> Found {
+    let mut result = Ok(String::new());
+    for case in cases {
+        result = check(case)?;
+        if result.is_err() {
+            break;
+        }
+    }
+    Ok(result)
+}

@@ -1,12 +1,23 @@
 //! Checks of passes over arrays.
-use super::compared::{Found, close, equal, worst};
-use crate::gpu::{Device, Recorder};
+use super::compared::{Found, close, each, equal, worst};
+use super::{Case, case};
+use crate::gpu::{Device, KernelVariant, Recorder};
 use crate::math::Random;
 use crate::pass::adam::{self, Class, Moments, Schedule};
 use crate::pass::close::Tolerance;
-use crate::pass::compact;
 use crate::pass::scan::{Scan, exclusive_scan};
 use crate::pass::sort::{Sort, SortAlgorithm, sort_pairs};
+use crate::pass::{compact, sum as sums};
+
+pub(super) const CASES: &[Case] = &[
+    case("buffers: upload, copy, fill, download", None, buffers),
+    case("prefix sum", None, scan),
+    case("radix sort", Some(KernelVariant::ChunkSort), |d| sort(d, SortAlgorithm::Chunks)),
+    case("radix sort", Some(KernelVariant::SweepSort), |d| sort(d, SortAlgorithm::Sweep)),
+    case("gather", None, gather),
+    case("sum", None, sum),
+    case("Adam", None, adam),
+];
 
 /// A prime number of elements, more than a workgroup.
 const COUNT: usize = 20_011;
@@ -16,7 +27,7 @@ fn words(count: usize, seed: u64) -> Vec<u32> {
     (0..count).map(|_| random.below(u32::MAX as usize) as u32).collect()
 }
 
-pub(super) fn buffers(device: &Device) -> Found {
+fn buffers(device: &Device) -> Found {
     let mut expected = words(COUNT, 1);
     let from = device.buffer_from("from", &expected)?;
     let to = device.buffer::<u32>("to", COUNT)?;
@@ -32,65 +43,109 @@ pub(super) fn buffers(device: &Device) -> Found {
     Ok(equal("words", &to.read()?, &expected))
 }
 
-pub(super) fn scan(device: &Device) -> Found {
-    let values: Vec<u32> = words(COUNT, 2).iter().map(|v| v >> 20).collect();
-    let buffer = device.buffer_from("values", &values)?;
-    let count = device.buffer_from("count", &[COUNT as u32])?;
-    let starts = device.buffer::<u32>("starts", COUNT)?;
-    let total = device.buffer::<u32>("total", 1)?;
-    let scan = Scan::new(device)?;
-    let mut rec = Recorder::new(device, "self-check of the prefix sum");
-    scan.record(&mut rec, &buffer, &count, &starts, &total);
-    rec.run()?;
-    let (expected, sum) = exclusive_scan(&values);
-    Ok(equal("total", &total.read()?, &[sum]).and(equal("starts", &starts.read()?, &expected)))
+fn scan(device: &Device) -> Found {
+    each([0, 1, COUNT], |n| {
+        let values: Vec<u32> = words(n, 2).iter().map(|v| v >> 20).collect();
+        let buffer = device.buffer_from("scan values", &values)?;
+        let count = device.buffer_from("scan count", &[n as u32])?;
+        let starts = device.buffer::<u32>("scan starts", n)?;
+        let total = device.buffer::<u32>("scan total", 1)?;
+        let scan = Scan::new(device)?;
+        let mut rec = Recorder::new(device, "self-check of the prefix sum");
+        scan.record(&mut rec, &buffer, &count, &starts, &total);
+        rec.run()?;
+        let (expected, sum) = exclusive_scan(&values);
+        // A buffer has at least one element.
+        let found = &starts.read()?[..n];
+        Ok(equal("total", &total.read()?, &[sum]).and(equal("starts", found, &expected)))
+    })
 }
 
-pub(super) fn sort(device: &Device, algorithm: SortAlgorithm) -> Found {
-    let mut expected: Vec<[u32; 2]> =
-        words(COUNT, 3).into_iter().zip(0..).map(|(k, v)| [k >> 4, v]).collect();
-    let pairs = device.buffer_from("pairs", expected.as_flattened())?;
-    let count = device.buffer_from("count", &[COUNT as u32])?;
-    let sort = Sort::with(device, COUNT, algorithm)?;
-    let mut rec = Recorder::new(device, "self-check of the sort");
-    // Fewer bits than the keys have, so that equal keys must keep their order.
-    sort.record(&mut rec, &pairs, &count, 20);
-    rec.run()?;
-    sort_pairs(&mut expected, 20);
-    Ok(equal("pairs", &pairs.read()?, expected.as_flattened()))
+/// Sorts the first `n` of `all` pairs by some of the bits of their keys, so that equal keys must
+/// keep their order.
+fn sort(device: &Device, algorithm: SortAlgorithm) -> Found {
+    let cases =
+        [(0, 5, 32, 4), (1, 1, 32, 4), (2049, 2049, 10, 4), (3000, 5000, 16, 26), (COUNT, COUNT, 20, 4)];
+    each(cases, |(n, all, bits, shift)| {
+        let mut expected: Vec<[u32; 2]> =
+            words(all, 3).into_iter().zip(0..).map(|(k, v)| [k >> shift, v]).collect();
+        let pairs = device.buffer_from("pairs", expected.as_flattened())?;
+        let count = device.buffer_from("count", &[n as u32])?;
+        let sort = Sort::with(device, all, algorithm)?;
+        let mut rec = Recorder::new(device, "self-check of the sort");
+        sort.record(&mut rec, &pairs, &count, bits);
+        rec.run()?;
+        sort_pairs(&mut expected[..n], bits);
+        Ok(equal("pairs", &pairs.read()?[..2 * n], expected[..n].as_flattened()))
+    })
 }
 
-pub(super) fn gather(device: &Device) -> Found {
-    let from = words(3 * COUNT, 4);
-    let index: Vec<u32> = words(COUNT / 2, 5).iter().map(|v| v % COUNT as u32).collect();
-    let (rows, indices) = (device.buffer_from("rows", &from)?, device.buffer_from("index", &index)?);
-    let gathered = compact::gather(device, "gathered", &rows, &indices, index.len(), 3)?;
-    Ok(equal("rows", &gathered.read()?, &compact::gather_rows(&from, &index, 3)))
+fn gather(device: &Device) -> Found {
+    each([(0, 1), (1, 1), (33, 7), (COUNT / 2, 3)], |(rows, stride)| {
+        let from = words(COUNT * stride, 4);
+        let index: Vec<u32> = words(rows, 5).iter().map(|v| v % COUNT as u32).collect();
+        let (source, indices) = (device.buffer_from("rows", &from)?, device.buffer_from("index", &index)?);
+        let gathered = compact::gather(device, "gathered", &source, &indices, rows, stride)?;
+        let found = &gathered.read()?[..rows * stride];
+        Ok(equal("rows", found, &compact::gather_rows(&from, &index, stride)))
+    })
 }
 
-pub(super) fn adam(device: &Device) -> Found {
+fn sum(device: &Device) -> Found {
+    each([1, 300, COUNT], |n| {
+        let mut random = Random::new(7);
+        let values: Vec<f32> = (0..n + 5).map(|_| random.uniform() as f32).collect();
+        let input = device.buffer_from("sum values", &values)?;
+        let partials = device.buffer::<f32>("sum partials", sums::PARTIALS)?;
+        let result = device.buffer_from("sum result", &[7.0f32; 3])?;
+        let mut rec = Recorder::new(device, "self-check of the sum");
+        sums::record(&mut rec, (&input, n), &partials, (&result, 1));
+        rec.run()?;
+        let expected: f64 = values[..n].iter().map(|v| f64::from(*v)).sum();
+        // Some 20 011 / 16 384 + 16 roundings of 6e-8 each.
+        let tolerance = Tolerance {
+            relative_l2: 2e-6,
+            absolute: 0.0,
+            relative: 2e-6,
+            outliers: 0.0,
+            outlier_factor: 1.0,
+        };
+        Ok(worst([close("sums", &result.read()?, &[7.0, expected, 7.0], &tolerance)]))
+    })
+}
+
+/// Rows with a head of other rates, and a gradient that is not finite.
+fn adam(device: &Device) -> Found {
+    let (stride, head, rates) = (9usize, 3usize, [1e-2, 1e-3]);
+    let count = 2_003 * stride;
     let mut random = Random::new(6);
-    let start: Vec<f32> = (0..COUNT).map(|_| random.normal() as f32).collect();
+    let start: Vec<f32> = (0..count).map(|_| random.normal() as f32).collect();
     let parameters = device.buffer_from("parameters", &start)?;
-    let gradients = device.buffer::<f32>("gradients", COUNT)?;
+    let gradients = device.buffer::<f32>("gradients", count)?;
     let guard = device.buffer::<u32>("guard", 2)?;
-    let moments = Moments::new(device, COUNT)?;
-    let mut schedule = Schedule::new(device, 1)?;
+    let moments = Moments::new(device, count)?;
+    let mut schedule = Schedule::new(device, 2)?;
     let mut expected: Vec<f64> = start.iter().map(|&v| v.into()).collect();
-    let mut state = vec![[0.0; 2]; COUNT];
-    for step in 1..=3 {
-        let g: Vec<f32> = (0..COUNT).map(|_| random.normal() as f32).collect();
+    let mut state = vec![[0.0; 2]; count];
+    const STEPS: usize = 3;
+    for step in 1..=STEPS {
+        let mut g: Vec<f32> = (0..count).map(|_| random.normal() as f32).collect();
+        g[5] = f32::NAN;
         gradients.write(&g)?;
-        schedule.set(step, &[[1e-2, 1e-2]])?;
+        schedule.set(step, &[[0.0; 2], rates])?;
         let mut rec = Recorder::new(device, "self-check of Adam");
-        let class = Class { slot: 0, count: COUNT, stride: 1, head: 1 };
+        let class = Class { slot: 1, count, stride: stride as u32, head: head as u32 };
         schedule.record(&mut rec, class, &parameters, &gradients, &moments, &guard);
         rec.run()?;
-        let g: Vec<f64> = g.iter().map(|&v| v.into()).collect();
-        adam::adam(&mut expected, &g, &mut state, 1e-2, adam::EPSILON, step);
+        for (i, g) in g.iter().enumerate() {
+            let (rate, one) = (rates[usize::from(i % stride >= head)], i..i + 1);
+            let (p, mv) = (&mut expected[one.clone()], &mut state[one]);
+            adam::adam(p, &[f64::from(*g)], mv, rate, adam::EPSILON, step);
+        }
     }
     // Three steps of 1e-2 on numbers around 1, rounded to f32.
     let tolerance =
         Tolerance { relative_l2: 1e-6, absolute: 2e-6, relative: 1e-6, outliers: 0.0, outlier_factor: 1.0 };
-    Ok(worst([close("parameters", &parameters.read()?, &expected, &tolerance)]))
+    let faults = equal("gradients that are not finite", &[schedule.faults()?], &[STEPS as u32]);
+    Ok(faults.and(worst([close("parameters", &parameters.read()?, &expected, &tolerance)])))
 }

@@ -7,9 +7,7 @@ mod render;
 
 use crate::Result;
 use crate::gpu::{Device, KernelVariant, Options};
-use crate::pass::sort::SortAlgorithm;
-use crate::pass::ssim_l1::SsimRowKernel;
-use crate::pass::{GradientReduction, ShGradientKernel, TileBinning, TileSums};
+use crate::pass::GradientReduction;
 use compared::Found;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
@@ -28,9 +26,13 @@ pub struct Row {
     pub outcome: std::result::Result<String, String>,
 }
 
-struct Case {
-    pass: &'static str,
-    variant: Option<KernelVariant>,
+/// A comparison of a pass, or of one of its variants, with the CPU reference.
+#[derive(Clone, Copy)]
+pub struct Case {
+    /// The pass.
+    pub pass: &'static str,
+    /// Its variant, where there are several.
+    pub variant: Option<KernelVariant>,
     check: fn(&Device) -> Found,
 }
 
@@ -38,43 +40,29 @@ const fn case(pass: &'static str, variant: Option<KernelVariant>, check: fn(&Dev
     Case { pass, variant, check }
 }
 
-/// All comparisons, in the order in which passes build on each other.
-const CASES: &[Case] = &[
-    case("buffers: upload, copy, fill, download", None, data::buffers),
-    case("prefix sum", None, data::scan),
-    case("radix sort", Some(KernelVariant::ChunkSort), |d| data::sort(d, SortAlgorithm::Chunks)),
-    case("radix sort", Some(KernelVariant::SweepSort), |d| data::sort(d, SortAlgorithm::Sweep)),
-    case("gather", None, data::gather),
-    case("Adam", None, data::adam),
-    case("projection and rendering", Some(KernelVariant::CountedLists), |d| {
-        render::forward(d, TileBinning::Counting)
-    }),
-    case("projection and rendering", Some(KernelVariant::SortedLists), |d| {
-        render::forward(d, TileBinning::Sorting)
-    }),
-    case("tile lists", Some(KernelVariant::SortedLists), render::sorted_lists),
-    case("blending weights by label", None, render::label_weights),
-    case("gradients", Some(KernelVariant::StoredGradients), |d| {
-        render::backward(d, GradientReduction::Entries)
-    }),
-    case("gradients", Some(KernelVariant::ShuffledSums), |d| render::tile_sums(d, TileSums::Shuffles)),
-    case("gradients", Some(KernelVariant::SharedSums), |d| render::tile_sums(d, TileSums::Shared)),
-    case("gradients of SH", Some(KernelVariant::ShPerThread), |d| {
-        render::sh_gradients(d, ShGradientKernel::PerThread)
-    }),
-    case("gradients of SH", Some(KernelVariant::ShShared), |d| {
-        render::sh_gradients(d, ShGradientKernel::Shared)
-    }),
-    case("projection backward with Adam", Some(KernelVariant::FusedUpdate), render::update),
-    case("depth and needle losses", None, render::regularisers),
-    case("SSIM and L1 loss", Some(KernelVariant::SsimStrips), |d| images::ssim_l1(d, SsimRowKernel::Strips)),
-    case("SSIM and L1 loss", Some(KernelVariant::SsimShared), |d| images::ssim_l1(d, SsimRowKernel::Shared)),
-    case("code loss", None, images::codes),
-    case("decoding of codes", None, images::decode),
-    case("search of a text query", Some(KernelVariant::DeviceQuery), images::query),
-    case("packing of images", None, images::pack),
-    case("plane sweep stereo", Some(KernelVariant::DeviceSweep), images::plane_sweep),
-];
+impl Case {
+    /// Runs the comparison.
+    pub fn row(&self, device: &Device) -> Row {
+        let begun = Instant::now();
+        let outcome = (self.check)(device).unwrap_or_else(|e| Err(e.to_string()));
+        Row { pass: self.pass, variant: self.variant, time: begun.elapsed(), outcome }
+    }
+}
+
+/// All comparisons, in the order in which passes build on each other, for a device with or without
+/// float atomics.
+pub fn cases(float_atomics: bool) -> impl Iterator<Item = Case> {
+    let listed = [data::CASES, render::CASES, images::CASES].into_iter().flatten();
+    listed.copied().chain([by_atomics(float_atomics)])
+}
+
+const fn by_atomics(float_atomics: bool) -> Case {
+    let variant = match float_atomics {
+        true => KernelVariant::FloatAtomics,
+        false => KernelVariant::AtomicGradients,
+    };
+    case("gradients", Some(variant), |d| render::backward(d, GradientReduction::Atomics))
+}
 
 /// Compares all passes and reports each row when it is done; an error of `report` ends the check.
 /// `device` is opened with `options` and should have no disabled variants. A wrong variant that can
@@ -86,14 +74,8 @@ pub fn run(
 ) -> Result<Vec<Row>> {
     let mut device = device.clone();
     let mut rows: Vec<Row> = Vec::new();
-    let by_atomics =
-        |variant| case("gradients", Some(variant), |d| render::backward(d, GradientReduction::Atomics));
-    let last = match device.info().float_atomics {
-        true => by_atomics(KernelVariant::FloatAtomics),
-        false => by_atomics(KernelVariant::AtomicGradients),
-    };
-    for case in CASES.iter().chain([&last]) {
-        rows.push(row(&device, case));
+    for case in cases(device.info().float_atomics) {
+        rows.push(case.row(&device));
         report(&rows[rows.len() - 1])?;
         let disabled = names(&wrong_variants(&rows));
         if disabled != device.info().disabled {
@@ -102,16 +84,10 @@ pub fn run(
     }
     if device.info().disabled.contains(KernelVariant::FloatAtomics.name()) {
         // The replacement of the disabled variant.
-        rows.push(row(&device, &by_atomics(KernelVariant::AtomicGradients)));
+        rows.push(by_atomics(false).row(&device));
         report(&rows[rows.len() - 1])?;
     }
     Ok(rows)
-}
-
-fn row(device: &Device, case: &Case) -> Row {
-    let begun = Instant::now();
-    let outcome = (case.check)(device).unwrap_or_else(|e| Err(e.to_string()));
-    Row { pass: case.pass, variant: case.variant, time: begun.elapsed(), outcome }
 }
 
 /// Names for [`Options::disabled`] and [`Device::disable`].

@@ -1,5 +1,6 @@
 //! Checks of rendering and its gradients.
 use super::compared::{Found, close, equal, worst};
+use super::{Case, case};
 use crate::gpu::{Device, KernelVariant, Recorder};
 use crate::math::Random;
 use crate::pass::adam::{BETA, EPSILON, Moments, Schedule, adam};
@@ -17,6 +18,24 @@ use crate::pass::{
 use crate::scene::Splats;
 use crate::scene::seeded;
 use glam::DVec3;
+
+pub(super) const CASES: &[Case] = &[
+    case("projection and rendering", Some(KernelVariant::CountedLists), |d| {
+        forward(d, TileBinning::Counting)
+    }),
+    case("projection and rendering", Some(KernelVariant::SortedLists), |d| forward(d, TileBinning::Sorting)),
+    case("tile lists", Some(KernelVariant::SortedLists), sorted_lists),
+    case("blending weights by label", None, label_weights),
+    case("gradients", Some(KernelVariant::StoredGradients), |d| backward(d, GradientReduction::Entries)),
+    case("gradients", Some(KernelVariant::ShuffledSums), |d| tile_sums(d, TileSums::Shuffles)),
+    case("gradients", Some(KernelVariant::SharedSums), |d| tile_sums(d, TileSums::Shared)),
+    case("gradients of SH", Some(KernelVariant::ShPerThread), |d| {
+        sh_gradients(d, ShGradientKernel::PerThread)
+    }),
+    case("gradients of SH", Some(KernelVariant::ShShared), |d| sh_gradients(d, ShGradientKernel::Shared)),
+    case("projection backward with Adam", Some(KernelVariant::FusedUpdate), update),
+    case("depth and needle losses", None, regularisers),
+];
 
 /// Image size in pixels, no multiple of the tile size.
 const SIZE: [u32; 2] = [75, 53];
@@ -63,7 +82,7 @@ impl Scene {
     }
 }
 
-pub(super) fn forward(device: &Device, grouping: TileBinning) -> Found {
+fn forward(device: &Device, grouping: TileBinning) -> Found {
     let scene = Scene::new(FEATURES);
     let (_, raster) = scene.rendered(device, DeviceChoices { grouping, ..DeviceChoices::of(device) })?;
     let reference = scene.reference();
@@ -75,7 +94,7 @@ pub(super) fn forward(device: &Device, grouping: TileBinning) -> Found {
 }
 
 /// Blending weights by label: two levels, of which one leaves pixels without a label.
-pub(super) fn label_weights(device: &Device) -> Found {
+fn label_weights(device: &Device) -> Found {
     let scene = Scene::new(FEATURES);
     let (params, mut raster) = scene.rendered(device, DeviceChoices::of(device))?;
     let pixels = (0..SIZE[0] * SIZE[1]).map(|p| [(p % SIZE[0]) as i32, (p / SIZE[0]) as i32]);
@@ -99,12 +118,12 @@ pub(super) fn label_weights(device: &Device) -> Found {
 
 /// Compares the tile lists by sorting with those by counters, of more splats than one chunk has and
 /// some on hundreds of tiles. Without counters that are right there is no comparison.
-pub(super) fn sorted_lists(device: &Device) -> Found {
+fn sorted_lists(device: &Device) -> Found {
     if device.info().disabled.contains(KernelVariant::CountedLists.name()) {
         return Ok(Ok("not compared".to_owned()));
     }
-    let [width, height] = [400, 300];
-    let (mut splats, camera) = seeded::small(3000, width, height, 0, 13);
+    let [width, height] = [200, 150];
+    let (mut splats, camera) = seeded::small(1000, width, height, 0, 13);
     splats.log_scales.iter_mut().step_by(100).for_each(|s| *s = [0.0; 3]);
     let params = SplatBuffers::upload(device, &splats, &[], 0)?;
     let lists = |grouping, summation| -> crate::Result<Vec<u32>> {
@@ -125,13 +144,13 @@ pub(super) fn backward(device: &Device, summation: GradientReduction) -> Found {
 }
 
 /// Without features, since blocks of features always use shuffles.
-pub(super) fn tile_sums(device: &Device, tile_sums: TileSums) -> Found {
+fn tile_sums(device: &Device, tile_sums: TileSums) -> Found {
     let choices =
         DeviceChoices { summation: GradientReduction::Atomics, tile_sums, ..DeviceChoices::of(device) };
     gradients(device, 0, choices)
 }
 
-pub(super) fn sh_gradients(device: &Device, sh_gradients: ShGradientKernel) -> Found {
+fn sh_gradients(device: &Device, sh_gradients: ShGradientKernel) -> Found {
     gradients(device, FEATURES, DeviceChoices { sh_gradients, ..DeviceChoices::of(device) })
 }
 
@@ -175,7 +194,7 @@ fn gradients(device: &Device, dim: usize, choices: DeviceChoices) -> Found {
     ]))
 }
 
-pub(super) fn update(device: &Device) -> Found {
+fn update(device: &Device) -> Found {
     if !fused_update::fits(device.info()) {
         return Ok(Ok(format!("not used: the device binds {} buffers", device.info().max_bindings)));
     }
@@ -240,7 +259,7 @@ pub(super) fn update(device: &Device) -> Found {
     Ok(worst(distances))
 }
 
-pub(super) fn regularisers(device: &Device) -> Found {
+fn regularisers(device: &Device) -> Found {
     let scene = Scene::new(FEATURES);
     let (params, raster) = scene.rendered(device, DeviceChoices::of(device))?;
     let frame = raster.frame();

@@ -10,8 +10,9 @@ mod passes;
 mod support;
 
 use executor::Interpreted;
+use passes::Scene;
 use spirv_interpreter::{Order, Schedule};
-use splatvk::gpu::shaders;
+use splatvk::gpu::{Module, shaders};
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
@@ -42,8 +43,8 @@ fn interpreted(subgroup_size: usize, float_atomics: bool) -> Interpreted {
 }
 
 /// Runs a scene; returns the panic message if it fails.
-fn outcome(scene: passes::Scene, on: &Interpreted) -> Result<(), String> {
-    let run = std::panic::AssertUnwindSafe(|| scene(&on.open()));
+fn outcome(scene: Scene, on: &Interpreted) -> Result<(), String> {
+    let run = std::panic::AssertUnwindSafe(|| scene.run(&on.open()));
     std::panic::catch_unwind(run).map_err(|payload| {
         let text = payload.downcast_ref::<String>().map(String::as_str);
         text.or(payload.downcast_ref::<&str>().copied()).unwrap_or("a panic").to_owned()
@@ -57,9 +58,9 @@ fn run_all(schedule: Schedule) -> BTreeSet<&'static str> {
     let mut ran = BTreeSet::new();
     for native in [true, false] {
         let on = Interpreted { schedule, ..interpreted(schedule.subgroup_size, native) };
-        let plain = if native { passes::PLAIN } else { &[] };
-        for (name, scene) in plain.iter().chain(passes::ADDING) {
-            if let Err(e) = outcome(*scene, &on) {
+        for scene in passes::all(native) {
+            if let Err(e) = outcome(scene, &on) {
+                let name = scene.name();
                 failed.push(format!("{name}, {schedule:?}, native float atomics {native}: {e}"));
             }
         }
@@ -67,6 +68,28 @@ fn run_all(schedule: Schedule) -> BTreeSet<&'static str> {
     }
     assert!(failed.is_empty(), "{}", failed.join("\n"));
     ran
+}
+
+/// Modules that run on a device, with the scenes that run them: the small ones, or the checks of
+/// passes that no small scene runs. Not those of benchmarks.
+fn runs(subgroup_size: usize, float_atomics: bool) -> Vec<(&'static Module, Vec<Scene>)> {
+    let scenes = passes::all(float_atomics).into_iter().map(|scene| {
+        let on = interpreted(subgroup_size, float_atomics);
+        assert_eq!(outcome(scene, &on), Ok(()));
+        (scene, on.ran.lock().unwrap().clone())
+    });
+    let scenes: Vec<_> = scenes.collect();
+    let modules = shaders::FAMILIES.iter().filter(|f| !f.name.starts_with("bench")).flat_map(|f| f.modules);
+    let with_scenes = |m: &'static Module| {
+        let runs = |small: bool| {
+            let kind = move |scene: &Scene| matches!(scene, Scene::Own(..)) == small;
+            let fits = scenes.iter().filter(move |(scene, ran)| kind(scene) && ran.contains(m.name));
+            fits.map(|(scene, _)| *scene).collect::<Vec<_>>()
+        };
+        let small = runs(true);
+        (m, if small.is_empty() { runs(false) } else { small })
+    };
+    modules.map(with_scenes).filter(|(_, scenes)| !scenes.is_empty()).collect()
 }
 
 /// Compares every pass with its reference; no shader file may be left out.
@@ -77,7 +100,10 @@ fn check_passes_at(subgroup_size: usize) {
         .filter(|f| !f.modules.iter().any(|m| ran.contains(m.name)))
         .map(|f| f.name)
         .collect();
-    assert!(forgotten.is_empty(), "no scene of tests/spirv/passes runs {forgotten:?}");
+    assert!(
+        forgotten.is_empty(),
+        "no case of src/check and no scene of tests/spirv/passes runs {forgotten:?}"
+    );
     let unknown: Vec<_> = SCRATCH.iter().filter(|name| !ran.contains(*name)).collect();
     assert!(unknown.is_empty(), "no pass has buffers named {unknown:?}");
 }
@@ -111,7 +137,7 @@ fn passes_match_reference_at_subgroup_64() {
 #[test]
 fn bands_stay_within_buffers() {
     let on = Interpreted { max_binding: Some(1 << 17), ..interpreted(32, true) };
-    assert_eq!(outcome(passes::bands, &on), Ok(()));
+    assert_eq!(outcome(Scene::Own("bands", passes::bands), &on), Ok(()));
 }
 
 /// Vulkan does not specify which invocations form a subgroup.
@@ -141,7 +167,7 @@ fn frame_ignores_previous_buffers() {
         "transmittance",
     ];
     let on = Interpreted { scratch, ..interpreted(32, true) };
-    assert_eq!(outcome(passes::image, &on), Ok(()));
+    assert_eq!(outcome(Scene::Own("image", passes::image), &on), Ok(()));
     let unknown: Vec<_> = scratch.iter().filter(|name| !on.ran.lock().unwrap().contains(*name)).collect();
     assert!(unknown.is_empty(), "no pass has buffers named {unknown:?}");
 }
@@ -164,5 +190,8 @@ fn every_module_in_every_order() {
     }
     let modules = shaders::FAMILIES.iter().flat_map(|f| f.modules);
     let forgotten: Vec<&str> = modules.map(|m| m.name).filter(|name| !ran.contains(name)).collect();
-    assert!(forgotten.is_empty(), "no scene of tests/spirv/passes runs {forgotten:?}");
+    assert!(
+        forgotten.is_empty(),
+        "no case of src/check and no scene of tests/spirv/passes runs {forgotten:?}"
+    );
 }

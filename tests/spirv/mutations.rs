@@ -1,7 +1,7 @@
 //! Whether faults are detected: shipped modules with one defect.
 use crate::executor::{Change, Interpreted};
 use crate::passes::{self, Scene};
-use crate::{interpreted, outcome};
+use crate::{interpreted, outcome, runs};
 use spirv_interpreter::module::{Instruction, assemble, instructions};
 use spirv_interpreter::spirv::Op;
 use spirv_interpreter::{Order, words as words_of};
@@ -27,60 +27,36 @@ fn fault_of(scene: Scene, on: &Interpreted, change: Change) -> String {
 /// Removes every barrier of every module in turn, at each of the subgroup `sizes`.
 pub fn without_barriers(sizes: &[usize]) -> usize {
     let mut removed = 0;
-    for &size in sizes {
-        for family in shaders::FAMILIES {
-            let fits = |m: &&Module| m.subgroup_size.is_none_or(|s| s as usize == size);
-            for module in family.modules.iter().filter(fits) {
-                let words = words_of(module.spirv);
-                let list = instructions(&words);
-                let barriers = list.iter().filter(|i| i.op == Op::ControlBarrier).count();
-                for skipped in 0..barriers {
-                    let mut count = 0..;
-                    let mut list = list.clone();
-                    list.retain(|i| i.op != Op::ControlBarrier || count.next() != Some(skipped));
-                    let (name, changed) = (module.name, assemble(&words, &list));
-                    let change: Change =
-                        Arc::new(move |m: &Module| (m.name == name).then(|| changed.clone()));
-                    let on = interpreted(size, module.float_atomics != Some(false));
-                    let fault = fault_of(scene_of(family.name, module), &on, change);
-                    // Subgroups that do not agree whether the workgroup has work part at the next
-                    // barrier.
-                    let found = ["Race", "a barrier that some subgroups do not reach"];
-                    let is_found = found.iter().any(|kind| fault.contains(kind));
-                    assert!(is_found, "{name}, barrier {skipped}: {fault}");
-                    removed += 1;
-                }
+    for (size, float_atomics) in sizes.iter().flat_map(|size| [(*size, true), (*size, false)]) {
+        let on = interpreted(size, float_atomics);
+        for (module, scenes) in runs(size, float_atomics) {
+            if float_atomics || module.float_atomics == Some(false) {
+                removed += without_each_barrier(module, &scenes, &on);
             }
         }
     }
     removed
 }
 
-/// Scene that runs a family with barriers.
-fn scene_of(family: &str, module: &Module) -> Scene {
-    let name = match family {
-        "scan_lanes" => "scan",
-        "raster_forward" => match module.variant[0] {
-            4 => "colours",
-            7 => "3 features",
-            12 => "8 features",
-            _ => "21 features",
-        },
-        "raster_backward_shared" => "tile sums in shared memory",
-        "count_pairs" => "pairs",
-        "bin_sweep" | "bin_large" => "lists by sorting",
-        "sum" => "sum",
-        "sort_offsets" => "sort in chunks",
-        "sort_digits" | "sort_sweep" => "sort in one sweep",
-        "ssim_rows_shared" => "ssim and l1",
-        "camera_sum" => "gradients by entry",
-        "fused_update" => "fused update",
-        "query_peaks" => "text query",
-        "project_backward" if module.variant[1] == 0 => "SH gradients per thread",
-        "project_backward" => "SH gradients in shared memory",
-        other => panic!("no scene is known to run the barriers of {other}"),
-    };
-    passes::named(name)
+/// Removes every barrier of a module in turn; one of the scenes finds a race each time.
+fn without_each_barrier(module: &'static Module, scenes: &[Scene], on: &Interpreted) -> usize {
+    let words = words_of(module.spirv);
+    let list = instructions(&words);
+    let barriers = list.iter().filter(|i| i.op == Op::ControlBarrier).count();
+    for skipped in 0..barriers {
+        let mut count = 0..;
+        let mut list = list.clone();
+        list.retain(|i| i.op != Op::ControlBarrier || count.next() != Some(skipped));
+        let (name, changed) = (module.name, assemble(&words, &list));
+        let change: Change = Arc::new(move |m: &Module| (m.name == name).then(|| changed.clone()));
+        let on = Interpreted { change: Some(change), ..on.clone() };
+        // Subgroups that do not agree whether the workgroup has work part at the next barrier.
+        let kinds = ["Race", "a barrier that some subgroups do not reach"];
+        let is_found = |fault: String| kinds.iter().any(|kind| fault.contains(kind));
+        let mut faults = scenes.iter().filter_map(|scene| outcome(*scene, &on).err());
+        assert!(faults.any(is_found), "{name}, barrier {skipped}");
+    }
+    barriers
 }
 
 /// First instruction with an opcode.
@@ -139,7 +115,7 @@ fn nonatomic_addition_is_race() {
         ];
         list.splice(at..=at, plain);
     });
-    let fault = fault_of(passes::named("sort in one sweep"), &interpreted(32, true), change);
+    let fault = fault_of(passes::named("radix sort, sort in one sweep"), &interpreted(32, true), change);
     assert!(fault.contains("sort_digits") && fault.contains("Race"), "{fault}");
 }
 
@@ -166,7 +142,7 @@ fn unwritten_shared_memory_is_reported() {
         let at = list.iter().position(|i| i.op == Op::Store).expect("a store");
         list.remove(at);
     });
-    let fault = fault_of(passes::named("sort in one sweep"), &interpreted(32, true), change);
+    let fault = fault_of(passes::named("radix sort, sort in one sweep"), &interpreted(32, true), change);
     assert!(fault.contains("Unwritten"), "{fault}");
 }
 
@@ -174,7 +150,7 @@ fn unwritten_shared_memory_is_reported() {
 #[test]
 fn unwritten_scratch_is_reported() {
     let on = Interpreted { scratch: &["scan values"], ..interpreted(32, true) };
-    assert!(outcome(passes::named("scan"), &on).expect_err("a fault").contains("Unwritten"));
+    assert!(outcome(passes::named("prefix sum"), &on).expect_err("a fault").contains("Unwritten"));
 }
 
 #[test]
@@ -201,7 +177,9 @@ fn raster_module(subgroup_size: u32) -> &'static Module {
 /// unlimited number of retries it would wait for ever.
 #[test]
 fn workgroup_order_dependence_is_reported() {
-    for (family, scene) in [("sort_sweep", "sort in one sweep"), ("bin_sweep", "lists by sorting")] {
+    for (family, scene) in
+        [("sort_sweep", "radix sort, sort in one sweep"), ("bin_sweep", "lists by sorting")]
+    {
         let scene = passes::named(scene);
         for order in [Order::Falling, Order::Rising] {
             assert_eq!(outcome(scene, &one_at_a_time(order)), Ok(()));

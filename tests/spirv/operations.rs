@@ -1,12 +1,12 @@
 //! Whether the comparisons with the CPU references detect a wrong operation: shipped modules with
 //! one operation replaced, as by a typing error.
 use crate::executor::{Change, Interpreted};
-use crate::passes::{self, Scene};
-use crate::{interpreted, outcome};
+use crate::passes::Scene;
+use crate::{interpreted, outcome, runs};
 use spirv_interpreter::module::{Instruction, assemble, instructions};
 use spirv_interpreter::spirv::Op;
 use spirv_interpreter::{Random, words as words_of};
-use splatvk::gpu::{Module, shaders};
+use splatvk::gpu::Module;
 use std::sync::Arc;
 
 /// Pairs of operations that replace each other.
@@ -26,7 +26,7 @@ const EXTREMES: [(u32, u32); 3] = [(37, 40), (38, 41), (39, 42)];
 
 /// Operations that are replaced in every module.
 const EACH: usize = 8;
-/// Percent that must be detected: 82 are (docs/internals/trust.md#shaders-without-a-device), and a
+/// Percent that must be detected: 80 are (docs/internals/trust.md#shaders-without-a-device), and a
 /// changed shader draws other operations. The others have no effect in scenes so small, or no
 /// effect at all, such as a bound that the next line tests again.
 const LEAST: usize = 77;
@@ -69,22 +69,6 @@ fn mutants(module: &Module) -> Vec<(String, Vec<u32>)> {
     made
 }
 
-/// Modules that run, with the scenes that run them.
-fn runs() -> Vec<(&'static Module, Vec<Scene>)> {
-    let scenes = passes::PLAIN.iter().chain(passes::ADDING).map(|(_, scene)| {
-        let on = interpreted(SUBGROUP, true);
-        assert_eq!(outcome(*scene, &on), Ok(()));
-        (*scene, on.ran.lock().unwrap().clone())
-    });
-    let scenes: Vec<_> = scenes.collect();
-    let modules = shaders::FAMILIES.iter().filter(|f| !f.name.starts_with("bench")).flat_map(|f| f.modules);
-    let with_scenes = |m: &'static Module| {
-        let own = scenes.iter().filter(|(_, ran)| ran.contains(m.name)).map(|(scene, _)| *scene);
-        (m, own.collect::<Vec<_>>())
-    };
-    modules.map(with_scenes).filter(|(_, scenes)| !scenes.is_empty()).collect()
-}
-
 fn is_detected(name: &'static str, changed: Vec<u32>, scenes: &[Scene]) -> bool {
     let change: Change = Arc::new(move |m: &Module| (m.name == name).then(|| changed.clone()));
     let on = Interpreted { change: Some(change), ..interpreted(SUBGROUP, true) };
@@ -95,7 +79,7 @@ fn is_detected(name: &'static str, changed: Vec<u32>, scenes: &[Scene]) -> bool 
 #[ignore = "takes long: tools/test-long"]
 fn replaced_operation_is_detected() {
     let (mut all, mut noticed) = (0, 0);
-    for (module, scenes) in runs() {
+    for (module, scenes) in runs(SUBGROUP, true) {
         let mut missed = Vec::new();
         let mutants = mutants(module);
         all += mutants.len();

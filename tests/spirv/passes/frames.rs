@@ -3,15 +3,11 @@ use crate::support::{
     IMAGE, Scene, assert_class, assert_close, assert_gradients, assert_images, assert_lists, assert_update,
     in_bands, rendered,
 };
-use splatvk::gpu::{Device, Recorder};
+use splatvk::gpu::Device;
 use splatvk::math::Random;
-use splatvk::pass::label_weights::{self, LabelWeights};
-use splatvk::pass::pack::{Encoding, FrameChannel, texels, texels_of};
 use splatvk::pass::raster_forward::{Cutoffs, ReferenceScene, walk};
-use splatvk::pass::{
-    DeviceChoices, FeatureMode, GradientReduction, Rasterizer, ShGradientKernel, TileBinning, TileSums,
-};
-use splatvk::pass::{bin, decode as decoding, pack as packing, pairs as counting};
+use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, ShGradientKernel, TileBinning, TileSums};
+use splatvk::pass::{bin, pairs as counting};
 use splatvk::scene::seeded;
 
 /// Splats over 27 × 19 pixels: 4 × 3 tiles, partial on two borders.
@@ -223,85 +219,4 @@ pub fn pairs(device: &Device) {
     assert!((blended - expected as f64).abs() <= 1.0, "{blended} of {expected}");
     let listed: usize = raster.tile_lists().unwrap().iter().map(Vec::len).sum();
     assert!(evaluated >= blended && evaluated <= 64.0 * listed as f64, "{evaluated} {listed}");
-}
-
-/// Blending weights by label: tiles of up to six label sets, pixels without a label.
-pub fn label_weights(device: &Device) {
-    let scene = scene(60, 0, 0, 1054);
-    let (params, mut raster) = scene.upload(device);
-    let stripes = (0..27 * 19).map(|p| (p % 27 + p / 27) / 4 % 3);
-    let columns = (0..27 * 19).map(|p| if p % 27 / 3 % 4 == 0 { -1 } else { 3 + p % 27 / 3 % 2 });
-    let labels: Vec<i32> = stripes.chain(columns).collect();
-    let mut sums = LabelWeights::new(60);
-    raster.add_label_weights(&params, &scene.options, &labels, &mut sums).unwrap();
-    let forward = scene.reference();
-    let reference = ReferenceScene {
-        projected: &forward.projected,
-        features: &[],
-        feature_dim: 0,
-        order: &forward.order,
-        view: &scene.view,
-    };
-    let difference = sums.difference(&label_weights::reference(&reference, &labels));
-    assert!(difference < 1e-3, "{difference}");
-}
-
-pub fn decode(device: &Device) {
-    for (dim, count, pixels) in [(3, 9, 300), (8, 20, 257), (16, 12, 290), (20, 11, 512)] {
-        let mut random = Random::new(1046);
-        let mut numbers = |n: usize| (0..n).map(|_| random.scaled_normal(1.0) as f32).collect::<Vec<f32>>();
-        let mut table = numbers(count * dim);
-        for row in table.chunks_exact_mut(dim) {
-            let norm = row.iter().map(|x| x * x).sum::<f32>().sqrt();
-            row.iter_mut().for_each(|x| *x /= norm);
-        }
-        let mut planes = numbers((dim + 2) * pixels);
-        // Every third pixel has a feature about as short as those without a code.
-        let length = |p: usize| if p.is_multiple_of(3) { 0.2 / (dim as f32).sqrt() } else { 1.0 };
-        planes.chunks_exact_mut(pixels).for_each(|plane| {
-            plane.iter_mut().enumerate().for_each(|(p, v)| *v *= length(p));
-        });
-        let alpha: Vec<f32> = (0..pixels).map(|p| (p % 11) as f32 / 10.0).collect();
-        let see_through: Vec<f32> = alpha.iter().map(|a| 1.0 - a).collect();
-        let features = device.buffer_from("features", &planes).unwrap();
-        let transmittance = device.buffer_from("transmittance", &see_through).unwrap();
-        let decoded = device.buffer::<i32>("decoded", pixels).unwrap();
-        let codes = decoding::Codes::upload(device, &table, dim).unwrap();
-        let mut rec = Recorder::new(device, "decode");
-        codes.record(&mut rec, &features, 2, &transmittance, pixels as u32, &decoded);
-        rec.run().unwrap();
-        let (expected, margin) = decoding::decode_pixels(&table, dim, &planes[2 * pixels..], &alpha);
-        for (p, got) in decoded.read().unwrap().into_iter().enumerate() {
-            // As in src/pass/decode.rs.
-            assert!(got == expected[p] || margin[p] < 8e-6, "pixel {p}: {got} {}", expected[p]);
-        }
-        assert!(expected.contains(&-1) && expected.iter().any(|k| *k >= 0));
-    }
-}
-
-pub fn pack(device: &Device) {
-    let (width, height, dim) = (19u32, 7u32, 6usize);
-    let pixels = (width * height) as usize;
-    let raster = Rasterizer::new(device, 1, dim, width, height).unwrap();
-    // As in src/pass/pack.rs: exact in half precision, and away from rounding ties.
-    let noise = |i: usize| ((i * 7919 + 13) % 97) as f32 / 64.0;
-    let planes: Vec<f32> = (0..(4 + dim) * pixels).map(noise).collect();
-    let transmittance: Vec<f32> = (0..pixels).map(|i| (i % 9) as f32 / 8.0).collect();
-    let band = raster.frame().bands.get(0);
-    raster.frame().planes.write(&planes).unwrap();
-    raster.frame().transmittance.write(&transmittance).unwrap();
-    for source in [FrameChannel::Colour, FrameChannel::Alpha, FrameChannel::Features(1, 5)] {
-        for encoding in [Encoding::F32, Encoding::F32x4, Encoding::F16x4, Encoding::Unorm8x4] {
-            let out = texels(device, pixels, source, encoding).unwrap();
-            packing::pack(device, raster.frame(), &band, source, encoding, &out).unwrap();
-            let expected = texels_of(&planes, &transmittance, source, encoding);
-            assert_eq!(out.cast::<u8>().read().unwrap(), expected, "{source:?} {encoding:?}");
-        }
-    }
-    let out = texels(device, pixels, FrameChannel::Depth, Encoding::F32).unwrap();
-    packing::pack(device, raster.frame(), &band, FrameChannel::Depth, Encoding::F32, &out).unwrap();
-    let expected = texels_of(&planes, &transmittance, FrameChannel::Depth, Encoding::F32);
-    let wide: Vec<f64> =
-        expected.chunks_exact(4).map(|b| f64::from(f32::from_le_bytes([b[0], b[1], b[2], b[3]]))).collect();
-    assert_close("depth", &out.cast::<f32>().read().unwrap(), &wide, &IMAGE);
 }
