@@ -124,6 +124,7 @@ fn sorted_lists(device: &Device) -> Found {
     }
     let [width, height] = [200, 150];
     let (mut splats, camera) = seeded::small(1000, width, height, 0, 13);
+    splats.log_scales.as_flattened_mut().iter_mut().for_each(|s| *s -= 1.0);
     splats.log_scales.iter_mut().step_by(100).for_each(|s| *s = [0.0; 3]);
     let params = SplatBuffers::upload(device, &splats, &[], 0)?;
     let lists = |grouping, summation| -> crate::Result<Vec<u32>> {
