@@ -1,4 +1,4 @@
-//! Where a scene shows what a text means: `cargo run --release --example query -- out/kitchen "blue
+//! Where a scene shows the thing that a text names: `cargo run --release --example query -- out/kitchen "blue
 //! mug" masks`.
 use splatvk::format::picture;
 use splatvk::gpu;

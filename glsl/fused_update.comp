@@ -165,7 +165,7 @@ void main() {
             // The numbers after the last splat, which fill its last vector, do not move.
             [[unroll]] for (uint k = 0; k < ROW; k++) gradients[thread * ROW + k] = 0.0;
         }
-        // Other threads move what this one has read.
+        // Other threads move the splats that this one has read.
         controlBarrier(gl_ScopeWorkgroup, gl_ScopeWorkgroup,
                        gl_StorageSemanticsBuffer | gl_StorageSemanticsShared, gl_SemanticsAcquireRelease);
         move_splats(first, min(GROUP, count - first));

@@ -147,7 +147,7 @@ void main() {
                 counters[s * 256u + digit] = total;
                 total += here;
             }
-            // Nobody asks for a digit that no pair has.
+            // A digit that no pair has is never used.
             if (everywhere[k] > 0u) {
                 uint flag = tile == 0u ? FLAG_INCLUSIVE : FLAG_AGGREGATE;
                 atomicOr(zeros[statuses + tile * 256u + digit], flag | total);

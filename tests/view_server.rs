@@ -303,7 +303,7 @@ fn training(out: &Path) -> (Running, Value, impl Iterator<Item = Value>) {
     (run, offer, events)
 }
 
-/// Waits until the page is told that the run has ended.
+/// Waits until the server reports the end of the run.
 fn wait_for_end(server: &Server) {
     let begun = Instant::now();
     while !server.request("GET", "state", "", "").1.contains("ended without a scene") {

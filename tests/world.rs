@@ -119,7 +119,7 @@ fn export_omits_unseen() {
     assert!(output.status.success(), "{}", text(&output.stderr));
     let (kept, language) = splatvk::format::gaussians::read(&out).unwrap();
     assert_eq!((kept.len(), language.unwrap().levels[2].features.as_slice()), (1, &[0.5][..]));
-    // With what is guessed: the unseen splat, and those behind the scene, without features.
+    // With guessed splats: the unseen one, and those behind the scene, without features.
     let out = folder.path().join("all.spz");
     let backdrop = Splats {
         means: vec![[0.0, 0.0, 9.0]; 2],

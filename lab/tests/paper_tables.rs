@@ -229,7 +229,7 @@ fn true_segmentation_scores_in_every_layout() {
     for (layout, data, paper, least) in [
         // LERF's masks are cut from smoothed maps: at this size edges move by much of an object.
         ("lerf", "lerf_ovs/teatime", 0.7125, 0.6),
-        // No object has the 2000 pixels that the paper's rule asks of a mask, so every answer is
+        // No object has the 2000 pixels that the paper's rule demands of a mask, so every answer is
         // that of the substitute rule.
         ("3dovs", "3d_ovs/bed", f64::NAN, 0.55),
         ("scannet", "scannet/scene0000_00", 0.4709, 0.8),

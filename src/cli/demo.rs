@@ -88,7 +88,7 @@ fn joined(run: Option<std::thread::ScopedJoinHandle<'_, Result<()>>>) -> Result<
     ended.unwrap_or_else(|_| Err(Error::work("the run of the demo ended early")))
 }
 
-/// Writes the photos, says how long it takes, and returns the plan of the run.
+/// Writes the photos, prints how long the run takes, and returns the plan of the run.
 fn plan(args: &DemoArgs, scene: &Path) -> Result<RunPlan> {
     let survey = splatvk_gpu::survey(&gpu::options(args.device.device.as_deref()))?;
     let info = survey.chosen?;

@@ -40,7 +40,7 @@ impl Losses {
     pub(super) const VIRTUAL: Losses =
         Losses { l1: 0.4, dssim: 0.0, depth: Some(0.02), needles: Some(1e-3), opacity: Some(0.75) };
 
-    /// Alpha that the objective asks of the pixels of a photo, −1 where it asks for none, and its
+    /// Target alpha of the pixels of a photo, −1 where there is none, and its
     /// weight per pixel.
     pub(super) fn wanted_alpha(&self, pixels: usize, coverage: Option<&Coverage>) -> Option<(Vec<f32>, f64)> {
         let (alpha, weight) = match (coverage, self.opacity) {

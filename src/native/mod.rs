@@ -2,7 +2,7 @@
 //!
 //! A driver on the processor, as lavapipe, reads and writes every number of a shader's buffers by
 //! itself and takes a microsecond per barrier; native code works on rows. The shaders remain the
-//! reference of what a pass does, and tests run on them; each native pass is compared with its
+//! reference of a pass, and tests run on them; each native pass is compared with its
 //! shader.
 mod adam;
 mod bin;

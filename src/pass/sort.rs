@@ -78,7 +78,7 @@ impl Key {
 pub(super) enum Prepared {
     /// The [`Sort::zeros`] are zero.
     Cleared,
-    /// Besides, the digits were counted where [`Sort::digits`] says.
+    /// Besides, [`Sort::digits`] has the counts of the digits.
     Counted,
 }
 

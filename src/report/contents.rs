@@ -150,7 +150,7 @@ pub struct Figure {
     pub label: &'static str,
     /// Value with its unit.
     pub value: String,
-    /// A sentence that says what it means.
+    /// A sentence that explains it.
     pub meaning: &'static str,
     /// Whether a reader needs it to judge the scene; the others are folded in the report.
     pub matters: bool,

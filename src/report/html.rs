@@ -255,7 +255,7 @@ mod tests {
         ] {
             assert!(html.contains(text), "{text}");
         }
-        // Words, photos, figures; what does not matter is folded.
+        // Words, photos, figures; details are folded.
         let at = |text: &str| html.find(text).unwrap_or_else(|| panic!("{text}"));
         let order =
             ["<h2>Words", "thousand everyday", "<h2>Photos", "<h2>Figures", "<dt>cameras", "<dt>splats"];

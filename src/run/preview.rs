@@ -39,7 +39,7 @@ impl Preview {
         Preview { folder: workspace.preview(), scene: scene.to_path_buf() }
     }
 
-    /// Writes the points of stereo as splats and says how to look at them, and then the splats of
+    /// Writes the points of stereo as splats, prints how to look at them, and then the splats of
     /// the training in the same place as they come, whole or not at all. A failure costs the run
     /// nothing but the preview.
     pub(super) fn show(

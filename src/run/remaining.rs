@@ -136,7 +136,7 @@ impl Course {
     fn overall(&self, now: f64) -> Option<Overall> {
         let current = self.parts.get(self.at)?;
         let elapsed = self.began.map_or(0.0, |began| now - began);
-        // Cameras are the first stage that says something of the machine.
+        // The time of the cameras is the first measure of the machine.
         let known = self.built_in && self.parts.iter().position(|p| p.stage == "cameras") <= Some(self.at);
         let running = if self.began.is_some() { self.share } else { 0.0 };
         let typical = self.finished[0] + running * current.seconds();
@@ -156,7 +156,7 @@ impl Course {
     }
 }
 
-/// Progress that tells where in a run the stages of the first lane are, and how long it still
+/// Progress that reports where in a run the stages of the first lane are, and how long it still
 /// takes.
 pub(super) struct WithRemaining<'a> {
     inner: &'a dyn Progress,

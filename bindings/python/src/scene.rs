@@ -19,7 +19,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 /// A Gaussian-splat scene: N Gaussians in scene units and OpenCV axes, the cameras of its photos,
-/// and what answers texts. Calls of one scene from several threads wait for each other.
+/// and the index that answers texts. Calls of one scene from several threads wait for each other.
 #[pyclass(module = "splatvk", frozen, weakref)]
 pub struct Scene {
     live: Mutex<LiveScene>,

@@ -1,4 +1,4 @@
-// The one place that knows whether float atomics exist. A shader that includes this file is compiled twice, with
+// The one place that depends on float atomics. A shader that includes this file is compiled twice, with
 // FLOAT_ATOMICS=1 (VK_EXT_shader_atomic_float) and FLOAT_ATOMICS=0 (compare-and-swap loop), and the device picks.
 //
 //   buffer Grad { ATOMIC_FLOAT grad[]; };      // 32-bit floats in memory either way
@@ -17,7 +17,7 @@ float atomic_addend(float value) {
 #define ATOMIC_VALUE(memory) (memory)
 #else
 #define ATOMIC_FLOAT uint
-// The first exchange guesses zero: a plain read of what others add to would be a data race.
+// The first exchange guesses zero: a plain read would race with the additions of others.
 #define ATOMIC_ADD(memory, value)                                                                  \
     do {                                                                                           \
         float atomic_addend = (value);                                                             \

@@ -397,7 +397,7 @@ impl Reader {
             bytes = bytes.max(member.end());
             push.push(member);
         }
-        // 128 bytes is what Vulkan guarantees and what lavapipe has.
+        // Vulkan guarantees 128 bytes, and lavapipe has no more.
         if bytes > 128 {
             return Err(format!("push constants take {bytes} bytes, more than the 128 every device has"));
         }

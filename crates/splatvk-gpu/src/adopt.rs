@@ -48,7 +48,7 @@ impl Device {
             return refuse("a handle is null; give instance, physical device, device and queue");
         }
         let entry = match host.get_instance_proc_addr {
-            // SAFETY: the host's function is what it says, per the contract.
+            // SAFETY: the contract requires this of the host's function.
             Some(get) => unsafe { ash::Entry::from_static_fn(ash::StaticFn { get_instance_proc_addr: get }) },
             None => select::load()?,
         };

@@ -31,7 +31,7 @@ struct Inner {
     bytes: u64,
     /// `None` only while dropping.
     block: Mutex<Option<Block>>,
-    /// Where recorded downloads go, and whether it holds what the buffer does.
+    /// Target of recorded downloads, and whether its content is that of the buffer.
     host: OnceLock<Buffer>,
     fetched: AtomicBool,
 }
@@ -56,7 +56,7 @@ fn byte_len<T>(len: usize) -> u64 {
     (len as u64).saturating_mul(size_of::<T>() as u64)
 }
 
-/// Vulkan knows no empty buffers, and shaders read whole vectors of four words up to the end.
+/// Vulkan has no empty buffers, and shaders read whole vectors of four words up to the end.
 fn padded(bytes: u64) -> u64 {
     bytes.max(16).next_multiple_of(16)
 }
@@ -156,7 +156,7 @@ impl<T> Buffer<T> {
         Ok(self.0.host.get_or_init(|| made))
     }
 
-    /// Whether `other` is what [`Buffer::host_copy`] made.
+    /// Whether `other` comes from [`Buffer::host_copy`].
     pub(crate) fn is_fetched_to<U>(&self, other: &Buffer<U>) -> bool {
         self.0.host.get().is_some_and(|copy| copy.id() == other.id())
     }

@@ -80,7 +80,7 @@ mod tests {
     fn a_compilation_is_told_of_while_it_lasts_and_once() {
         let time = CompileTime(Mutex::new(Some(Duration::from_millis(20))));
         let (said, hears) = channel();
-        // It ends only when it has been told of.
+        // It ends only when its end has been reported.
         assert!(time.watched(|| said.send(()).unwrap(), || hears.recv_timeout(PATIENCE * 10)).is_ok());
         let again = AtomicBool::new(false);
         let say = || again.store(true, Ordering::SeqCst);

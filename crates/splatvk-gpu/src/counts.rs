@@ -1,4 +1,4 @@
-//! Counted work of a device: what costs time on every machine.
+//! Counted work of a device: operations that cost time on every machine.
 use crate::device::Device;
 use std::ops::Sub;
 use std::sync::atomic::{AtomicU64, Ordering};

@@ -147,7 +147,7 @@ pub(crate) fn adopted(
     describe(instance, candidate, &offer, queue_family, options, atomics)
 }
 
-/// The public description; also what `doctor` prints for devices it does not open.
+/// The public description; `doctor` also prints it for devices that it does not open.
 fn describe(
     instance: &ash::Instance,
     candidate: &Candidate,
@@ -164,7 +164,7 @@ fn describe(
     if core13 || offer.subgroup_control {
         properties = properties.push_next(&mut control);
     }
-    // SAFETY: plain queries on a physical device of this instance, with structures it knows.
+    // SAFETY: plain queries on a physical device of this instance, with structures of its version.
     let (families, memory) = unsafe {
         instance.get_physical_device_properties2(candidate.physical, &mut properties);
         (

@@ -29,7 +29,7 @@ pub(crate) struct Heap {
     current: AtomicU64,
     peak: AtomicU64,
     allocations: AtomicU64,
-    /// The driver says of this allocation and all later ones that there is no memory: see
+    /// The driver refuses this allocation and all later ones for lack of memory: see
     /// [`Heap::exhaust_after`].
     #[cfg(feature = "testing")]
     exhausted_from: AtomicU64,

@@ -9,7 +9,7 @@ use std::ffi::CStr;
 pub const INSTALL: &str = "on Debian or Ubuntu: apt install libvulkan1 mesa-vulkan-drivers (the second also \
                                   brings lavapipe, a device that runs on the CPU)";
 
-/// A physical device with what decides whether and when it is used.
+/// A physical device with the properties that decide whether and when it is used.
 pub(crate) struct Candidate {
     pub physical: vk::PhysicalDevice,
     pub properties: vk::PhysicalDeviceProperties,

@@ -67,7 +67,7 @@ impl Batch {
         let (from, bytes) = (self.used, data.len() as u64);
         let memory = self.block.as_mut().and_then(Block::bytes_mut).ok_or_else(not_mapped)?;
         memory[from as usize..][..data.len()].copy_from_slice(data);
-        // Copies of whole words from whole words are what drivers are fast at.
+        // Drivers are fast at copies of whole words.
         self.used = (from + bytes).next_multiple_of(16).min(self.capacity);
         self.pending.push(Pending::Write { target, at, from, bytes });
         Ok(())

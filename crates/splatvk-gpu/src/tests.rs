@@ -124,7 +124,7 @@ fn validation_messages_are_collected() {
     let device = Device::open(&Options { validation: true, ..Options::default() }).unwrap();
     assert!(device.validation_messages().is_empty());
     let info = ash::vk::BufferCreateInfo::default().size(0).usage(ash::vk::BufferUsageFlags::STORAGE_BUFFER);
-    // SAFETY: a size of zero is what the layer must object to; nothing is done with the buffer.
+    // SAFETY: the layer must report a size of zero; nothing is done with the buffer.
     unsafe {
         if let Ok(raw) = device.0.device.create_buffer(&info, None) {
             device.0.device.destroy_buffer(raw, None);

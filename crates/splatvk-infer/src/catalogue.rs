@@ -87,7 +87,7 @@ pub struct Source {
     pub sha256: Option<String>,
 }
 
-/// An export script with what it needs.
+/// An export script with its requirements.
 #[derive(Clone, Debug, PartialEq, Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recipe {

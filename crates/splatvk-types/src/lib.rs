@@ -3,7 +3,7 @@
 //! - [`scene`]: cameras, splats, images, depth maps, point clouds and language fields, with the
 //!   conventions of axes and units.
 //! - [`math`]: one random generator, statistics, dot products.
-//! - [`Error`] and [`Result`]: errors by what a program may do about them.
+//! - [`Error`] and [`Result`]: errors by the reaction that a program may have.
 //! - [`progress`] and [`checkpoint`]: progress, cancellation and resumption of long work.
 //! - [`files`]: bounded reading, atomic writing; owners of unfinished work.
 //!

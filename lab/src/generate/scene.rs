@@ -253,7 +253,7 @@ fn place_objects(spec: &SceneSpec, random: &mut Random, objects: &mut Vec<SceneO
     random.shuffle(&mut names);
     let kinds = spec.objects - spec.similar;
     let unit = spec.unit();
-    // Radius that --occlusion asks for; where no room is left, it grows in steps up to the table.
+    // Radius for --occlusion; where no room is left, it grows in steps up to the table.
     let closest = 0.42 - 0.16 * spec.occlusion;
     let reaches =
         || (0..).map(|i| closest + 0.04 * f64::from(i)).take_while(|r| *r <= TABLE).map(|r| r * unit);

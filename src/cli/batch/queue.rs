@@ -234,7 +234,7 @@ impl<'a> Queue<'a> {
         self.store.event(name, fields)?;
         self.store.fail(&failure, Some((&folder, &log)))?;
         if failure.kind == FailureKind::Unwritable {
-            // The message without what is said again around it.
+            // The message without the words that the caller repeats.
             let words = failure.message.rsplit(": cannot be written: ").next().unwrap_or_default();
             let words = words.split(';').next().unwrap_or_default();
             let source = std::io::Error::other(words.to_owned());

@@ -52,7 +52,7 @@ pub struct InputFile {
     pub sha256: String,
 }
 
-/// Key of a row, and what it stands for.
+/// Key of a row, and its meaning.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct RowKey {
     /// SHA-256 of contents, options and versions.

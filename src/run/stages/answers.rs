@@ -65,7 +65,7 @@ impl Stage for AnswerQueries {
         let mut backgrounds = HashMap::new();
         let mut answer = |query: &TextQuery| {
             for note in query.reading.notes() {
-                // No warning: the scene is as good as ever, and the answer says it.
+                // No warning: the scene is as good as ever, and the answer contains it.
                 context.progress.inform(&format!("“{}”: {note}", query.text));
             }
             // Texts of one form share their alternatives.

@@ -30,7 +30,7 @@ pub(super) const SPLATS: &str = "point_cloud.ply";
 /// Blending weight of every splat in the photos, [N] f32 ([`Seen`]).
 pub(super) const SEEN: &str = "seen.npy";
 
-/// Splats behind the scene, which are no part of it: blurred colours of what lies around.
+/// Splats behind the scene, which are no part of it: blurred colours of the surroundings.
 pub(super) const BACKDROP: &str = "backdrop.ply";
 
 /// A loaded scene.

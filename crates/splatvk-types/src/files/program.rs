@@ -1,4 +1,4 @@
-//! The file of the running code, and what was installed beside it.
+//! The file of the running code, and the files installed beside it.
 use std::io;
 use std::path::{Path, PathBuf};
 
