@@ -68,7 +68,6 @@ pub mod eval;
 pub mod fetch;
 pub mod fit;
 pub mod gpu;
-pub mod native;
 pub mod pass;
 pub mod pipeline;
 pub mod report;

@@ -1,6 +1,7 @@
 //! The GPU engine [`splatvk_gpu`], the generated bindings of `glsl/`, and the choices of the
 //! program that the crate leaves open: environment variables and the folder of the cache.
 mod folder;
+pub mod native;
 mod options;
 pub mod report;
 #[doc(hidden)]

@@ -1,6 +1,6 @@
 //! Options of a device from the environment.
-use super::{KernelVariant, folder::FolderCache};
-use crate::{Error, native};
+use super::{KernelVariant, folder::FolderCache, native};
+use crate::Error;
 use splatvk_gpu::{Cache, Device, Options};
 use std::sync::Arc;
 

@@ -1,9 +1,10 @@
 //! Working on a Vulkan device that the host program made and keeps.
+use crate::choice::Candidate;
 use crate::device::{Device, QueueLock, Setup};
 use crate::enabled::EnabledFeatures;
 use crate::features;
 use crate::info::Options;
-use crate::select::{self, Candidate};
+use crate::select;
 use crate::{Error, Result};
 use ash::vk;
 use std::ffi::{CStr, CString};

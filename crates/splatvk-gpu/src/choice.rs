@@ -1,7 +1,24 @@
 //! The choice of a physical device: by number, name, UUID or PCI address.
-use crate::select::{Candidate, INSTALL};
 use crate::{Error, Result};
+use ash::vk;
 use std::fmt::Write;
+
+/// Advice where there is no loader or no device. lavapipe makes a machine without a GPU work.
+pub const INSTALL: &str = "on Debian or Ubuntu: apt install libvulkan1 mesa-vulkan-drivers (the second also \
+                                  brings lavapipe, a device that runs on the CPU)";
+
+/// A physical device with the properties that decide whether and when it is used.
+pub(crate) struct Candidate {
+    pub physical: vk::PhysicalDevice,
+    pub properties: vk::PhysicalDeviceProperties,
+    pub name: String,
+    /// Equal for every driver of the card; `nvidia-smi -L` prints it, too.
+    pub uuid: [u8; 16],
+    /// Where the driver reports it.
+    pub pci: Option<Pci>,
+    /// Why it cannot be used, if so.
+    pub unusable: Option<String>,
+}
 
 /// Vendor number of NVIDIA, the devices of CUDA.
 const NVIDIA: u32 = 0x10de;

@@ -1,10 +1,11 @@
 //! Device features: the offered ones, the enabled ones, and the shader capabilities that follow.
 use crate::choice;
+use crate::choice::Candidate;
 use crate::enabled::EnabledFeatures;
 use crate::error::vk_error;
 use crate::info::{DeviceInfo, Options};
 use crate::module::Capability;
-use crate::select::{self, Candidate};
+use crate::select;
 use crate::{Error, Result};
 use ash::vk;
 use std::collections::BTreeSet;

@@ -103,6 +103,7 @@ pub use buffer::Buffer;
 pub use bytemuck;
 pub use cache::Cache;
 pub use call::Call;
+pub use choice::INSTALL;
 #[cfg(feature = "testing")]
 pub use command::{Groups, Op};
 pub use compile_time::on_long_compilation;
@@ -118,7 +119,6 @@ pub use module::{Access, Binding, Capability, Family, Module};
 pub use native::{Memory as NativeMemory, Native, NativeCall};
 pub use program::Program;
 pub use recorder::Recorder;
-pub use select::INSTALL;
 pub use survey::{Survey, Surveyed, survey};
 #[cfg(feature = "testing")]
 pub use testing::TestDevice;

@@ -1,26 +1,9 @@
 //! Vulkan loader, instance and physical devices.
-use crate::choice::{self, Pci};
+use crate::choice::{self, Candidate, INSTALL, Pci};
 use crate::validation;
 use crate::{Error, Options, Result};
 use ash::vk;
 use std::ffi::CStr;
-
-/// Advice where there is no loader or no device. lavapipe makes a machine without a GPU work.
-pub const INSTALL: &str = "on Debian or Ubuntu: apt install libvulkan1 mesa-vulkan-drivers (the second also \
-                                  brings lavapipe, a device that runs on the CPU)";
-
-/// A physical device with the properties that decide whether and when it is used.
-pub(crate) struct Candidate {
-    pub physical: vk::PhysicalDevice,
-    pub properties: vk::PhysicalDeviceProperties,
-    pub name: String,
-    /// Equal for every driver of the card; `nvidia-smi -L` prints it, too.
-    pub uuid: [u8; 16],
-    /// Where the driver reports it.
-    pub pci: Option<Pci>,
-    /// Why it cannot be used, if so.
-    pub unusable: Option<String>,
-}
 
 fn no_device(message: String, cause: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> Error {
     Error::NoDevice { message, source: Some(cause.into()) }

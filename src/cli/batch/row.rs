@@ -17,8 +17,6 @@ use std::collections::BTreeSet;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
-/// File of a finished row, written last.
-pub const SUCCESS: &str = "_SUCCESS.json";
 /// Version of the key: other contents of it get another number.
 const KEY_VERSION: u32 = 1;
 /// Options of a row beside those of a configuration.
@@ -191,7 +189,7 @@ impl PlannedRow<'_> {
         if let Some(size) = args.max_size {
             record["smaller_max_size"] = size.into();
         }
-        store::write(&out.join(SUCCESS), format!("{record:#}\n").as_bytes())
+        store::write(&out.join(store::SUCCESS), format!("{record:#}\n").as_bytes())
     }
 }
 

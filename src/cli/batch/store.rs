@@ -3,7 +3,6 @@
 //! `ID/` is a finished row, `_failed/ID.json` and `.log` the last failure of another one,
 //! `_attempts` holds unfinished work, and `events.jsonl` is only appended to.
 use super::child::Ending;
-use super::row::SUCCESS;
 use crate::files::{self, Partial, swap};
 use crate::sync::lock;
 use crate::{Error, Result};
@@ -16,6 +15,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{SystemTime, UNIX_EPOCH};
 
+/// File of a finished row, written last.
+pub const SUCCESS: &str = "_SUCCESS.json";
 const FAILED: &str = "_failed";
 const ATTEMPTS: &str = "_attempts";
 

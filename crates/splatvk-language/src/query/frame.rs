@@ -2,7 +2,8 @@
 use super::maps::{CodeMaps, LevelMap};
 use super::result::{AnswerImages, Mask, QueryResult};
 use super::score::margin;
-use super::window::{AREA, Part, UNIT, box_rows, whole};
+pub use super::window::Table;
+use super::window::{AREA, Part, blended, box_rows};
 use super::{
     MaskRule, QueryOptions, TextQuery, coarsest_good, code_bar, field_relevancy, filter, first_best,
 };
@@ -13,47 +14,6 @@ use std::sync::Arc;
 
 /// Fewest rows of a band: the box reads 29 rows besides its own.
 const LEAST_ROWS: usize = 60;
-
-/// Relevancy of the codes of a level in whole numbers, [K + 1]; the last is that of pixels without a
-/// code.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Table(Vec<u32>);
-
-impl Table {
-    /// Table of relevancies [K].
-    pub fn new(relevancy: &[f32]) -> Table {
-        Table(relevancy.iter().map(|r| whole(*r)).chain([0]).collect())
-    }
-
-    /// Excess over a canonical phrase, `max(0, 2·rel − 1)`.
-    fn excess(&self) -> Table {
-        Table(self.0.iter().map(|v| (2 * v).saturating_sub(UNIT)).collect())
-    }
-
-    /// [K + 1] values.
-    pub fn values(&self) -> &[u32] {
-        &self.0
-    }
-
-    fn at(&self, code: usize) -> u32 {
-        self.0.get(code).copied().unwrap_or(0)
-    }
-
-    /// Values of pixels.
-    pub(super) fn gather(&self, codes: &[u16], out: &mut [u32]) {
-        let last = self.0.len() - 1;
-        for (out, code) in out.iter_mut().zip(codes) {
-            *out = self.0[usize::from(*code).min(last)];
-        }
-    }
-
-    fn gather_more(&self, codes: &[u16], out: &mut [u32]) {
-        let last = self.0.len() - 1;
-        for (out, code) in out.iter_mut().zip(codes) {
-            *out += self.0[usize::from(*code).min(last)];
-        }
-    }
-}
 
 /// A level of a frame in a query of [`MaskRule::Codes`].
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -234,12 +194,6 @@ impl Frame<'_> {
     }
 }
 
-/// `½ (box + raw)` from 900 times the value and the sum of the box.
-pub(super) fn blended(sum: u32) -> f32 {
-    const SCALE: f64 = 1.0 / (2.0 * AREA as f64 * UNIT as f64);
-    (f64::from(sum) * SCALE) as f32
-}
-
 /// Largest sum of 900 times the value of a pixel and of its box. A sum of the box is at most 900 times
 /// the largest value, so that codes whose value is too small for the peak of the best code need not
 /// be searched: often a part of the frame is enough.
@@ -283,7 +237,7 @@ fn locate_codes(maps: &CodeMaps, tables: &[Table], level: usize, codes: &[u16], 
         .levels
         .iter()
         .zip(tables)
-        .filter(|(_, t)| t.0.len() > 1)
+        .filter(|(_, t)| t.values().len() > 1)
         .map(|(m, t)| (&m.codes[..], t))
         .collect();
     let fill = |y: usize, x: usize, row: &mut [u32]| {

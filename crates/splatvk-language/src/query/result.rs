@@ -1,7 +1,6 @@
 //! The answer to a query in one frame, with its images.
-use super::frame::{Table, blended};
 use super::maps::{CodeMaps, LevelMap};
-use super::window::{AREA, Part, box_rows};
+use super::window::{AREA, Part, Table, blended, box_rows};
 use crate::scene::Image;
 use rayon::prelude::*;
 use std::sync::Arc;

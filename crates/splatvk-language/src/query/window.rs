@@ -28,6 +28,53 @@ pub fn whole(relevancy: f32) -> u32 {
     (relevancy.clamp(0.0, 1.0) * UNIT as f32).round() as u32
 }
 
+/// Relevancy of the codes of a level in whole numbers, [K + 1]; the last is that of pixels without a
+/// code.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Table(Vec<u32>);
+
+impl Table {
+    /// Table of relevancies [K].
+    pub fn new(relevancy: &[f32]) -> Table {
+        Table(relevancy.iter().map(|r| whole(*r)).chain([0]).collect())
+    }
+
+    /// Excess over a canonical phrase, `max(0, 2·rel − 1)`.
+    pub(super) fn excess(&self) -> Table {
+        Table(self.0.iter().map(|v| (2 * v).saturating_sub(UNIT)).collect())
+    }
+
+    /// [K + 1] values.
+    pub fn values(&self) -> &[u32] {
+        &self.0
+    }
+
+    pub(super) fn at(&self, code: usize) -> u32 {
+        self.0.get(code).copied().unwrap_or(0)
+    }
+
+    /// Values of pixels.
+    pub(super) fn gather(&self, codes: &[u16], out: &mut [u32]) {
+        let last = self.0.len() - 1;
+        for (out, code) in out.iter_mut().zip(codes) {
+            *out = self.0[usize::from(*code).min(last)];
+        }
+    }
+
+    pub(super) fn gather_more(&self, codes: &[u16], out: &mut [u32]) {
+        let last = self.0.len() - 1;
+        for (out, code) in out.iter_mut().zip(codes) {
+            *out += self.0[usize::from(*code).min(last)];
+        }
+    }
+}
+
+/// `½ (box + raw)` from 900 times the value and the sum of the box.
+pub(super) fn blended(sum: u32) -> f32 {
+    const SCALE: f64 = 1.0 / (2.0 * AREA as f64 * UNIT as f64);
+    (f64::from(sum) * SCALE) as f32
+}
+
 /// A rectangle of pixels.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Part {
