@@ -226,8 +226,11 @@ impl Prepared {
         search: Option<&mut dyn FrameSearch>,
     ) -> Result<Answers> {
         let cosines = self.cosines(field, &query.canonicals);
-        let relevancy = cosines.relevancy(field, query)?;
-        let evidence = self.evidence(field, query, &cosines, background);
+        let relevancy = cosines.relevancy(field, query, options)?;
+        let evidence = match options.published {
+            true => None,
+            false => self.evidence(field, query, &cosines, background),
+        };
         // Without evidence an unclear text is unsure.
         let doubt = query.reading.is_doubtful().then_some(Presence::Unsure);
         let fits = evidence.is_none_or(|e| e.presence != Presence::Absent);
@@ -359,12 +362,29 @@ mod tests {
 
     impl Wall {
         fn ask(&self, text: &str, reading: Reading) -> Answers {
+            self.ask_with(text, reading, &QueryOptions::default())
+        }
+
+        fn ask_with(&self, text: &str, reading: Reading, options: &QueryOptions) -> Answers {
             let alternatives = Alternatives { things: self.things.clone(), colours: Vec::new() };
             let query = TextQuery { alternatives, reading, ..rule_query(text) };
             let views = (&self.cameras[..], &self.frames[..]);
-            self.prepared
-                .answer(&self.field, views, &query, &QueryOptions::default(), &mut None, None)
-                .unwrap()
+            self.prepared.answer(&self.field, views, &query, options, &mut None, None).unwrap()
+        }
+    }
+
+    /// The protocols of LERF and LangSplat score a mask for every text.
+    #[test]
+    fn published_answer_has_mask_for_absent_text() {
+        let mut wall = wall();
+        wall.things = Arc::new(text_embedding("lemon").repeat(100));
+        let own = wall.ask("lemon", Reading::default());
+        assert_eq!((own.presence, own.found()), (Some(Presence::Absent), 0));
+        for compat in crate::run::compat::COMPATS {
+            let options = crate::run::compat::query_options(Some(compat));
+            let a = wall.ask_with("lemon", Reading::default(), &options);
+            assert_eq!((a.presence, a.p_value, a.found()), (None, None, 1), "{}", compat.name);
+            assert!(a.views[0].mask().data.contains(&true) && !a.selection.splats.is_empty());
         }
     }
 

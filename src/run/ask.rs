@@ -112,13 +112,14 @@ impl QuerySession {
 
     /// The understood part of a text.
     pub(super) fn reading(&mut self, text: &str) -> Result<Reading> {
-        Ok(self.query(text)?.reading.clone())
+        Ok(self.query(text, false)?.reading.clone())
     }
 
-    fn query(&mut self, text: &str) -> Result<Arc<TextQuery>> {
+    fn query(&mut self, text: &str, verbatim: bool) -> Result<Arc<TextQuery>> {
         let (encoder, alternatives) = (self.encoder.as_mut(), &mut self.alternatives_cache);
         let canonicals = &self.canonicals;
-        self.recent.entry(text, |text| as_query(text, encoder, canonicals, alternatives, false))
+        self.recent
+            .entry((text, verbatim), |text| as_query(text, encoder, canonicals, alternatives, verbatim))
     }
 
     /// Answers a text in views.
@@ -131,7 +132,7 @@ impl QuerySession {
         options: &QueryOptions,
         search: Option<&mut dyn FrameSearch>,
     ) -> Result<Answers> {
-        let query = self.query(text)?;
+        let query = self.query(text, options.published)?;
         self.decode_own_views(viewer, field, views)?;
         let understood = query.reading.phrasing.as_ref().map_or(text, |p| &p.answers_for);
         let form = things::form(understood);

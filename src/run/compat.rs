@@ -143,7 +143,13 @@ pub fn feature_dim(compat: Option<&Compat>, method: &Method) -> usize {
 
 /// Query options of a set.
 pub fn query_options(compat: Option<&Compat>) -> QueryOptions {
-    compat.map_or_else(QueryOptions::default, |c| QueryOptions { mask: c.mask, ..QueryOptions::default() })
+    compat.map_or_else(QueryOptions::default, |c| QueryOptions {
+        mask: c.mask,
+        // Every text has a mask.
+        abs_threshold: 0.0,
+        published: true,
+        ..QueryOptions::default()
+    })
 }
 
 #[cfg(test)]

@@ -200,7 +200,9 @@ impl ScenePlan<'_> {
     }
 
     fn query_inputs(&mut self, encoder: SharedEncoder) -> QueryInputs {
-        let embed = stages::EmbedQueries { encoder: encoder.clone(), texts: self.queries.to_vec() };
+        let compat = self.config.language.as_ref().and_then(|language| language.compat);
+        let (texts, verbatim) = (self.queries.to_vec(), query_options(compat).published);
+        let embed = stages::EmbedQueries { encoder: encoder.clone(), texts, verbatim };
         QueryInputs { queries: self.build.graph.add(embed, ()), encoder }
     }
 

@@ -13,24 +13,25 @@ const MOST_QUERIES: usize = 64;
 /// Cache by text; evicts the least recently asked text.
 #[derive(Default)]
 pub(super) struct RecentQueries {
-    /// Ordered by use, the latest last.
-    list: Vec<Arc<TextQuery>>,
+    /// Whether all words count, and the query; ordered by use, the latest last.
+    list: Vec<(bool, Arc<TextQuery>)>,
 }
 
 impl RecentQueries {
-    /// Returns the query of a text; makes it if it is absent.
+    /// Returns the query of a text, of which all words count with `verbatim`; makes it if it is
+    /// absent.
     pub(super) fn entry<E>(
         &mut self,
-        text: &str,
+        (text, verbatim): (&str, bool),
         make: impl FnOnce(&str) -> Result<TextQuery, E>,
     ) -> Result<Arc<TextQuery>, E> {
-        let query = match self.list.iter().position(|known| known.text == text) {
-            Some(index) => self.list.remove(index),
+        let query = match self.list.iter().position(|known| known.0 == verbatim && known.1.text == text) {
+            Some(index) => self.list.remove(index).1,
             None => Arc::new(make(text)?),
         };
         let surplus = (self.list.len() + 1).saturating_sub(MOST_QUERIES);
         self.list.drain(..surplus);
-        self.list.push(query.clone());
+        self.list.push((verbatim, query.clone()));
         Ok(query)
     }
 }
@@ -94,7 +95,7 @@ mod tests {
     fn queries_are_made_once_and_bounded() {
         let (mut recent, mut made) = (RecentQueries::default(), 0);
         let mut ask = |text: String| {
-            let query = recent.entry(&text, |text| {
+            let query = recent.entry((&text, false), |text| {
                 made += 1;
                 Ok::<_, ()>(TextQuery { text: text.to_owned(), ..TextQuery::default() })
             });
@@ -111,7 +112,7 @@ mod tests {
         // "mug" and "mug " are evicted, "cup" was asked later.
         assert_eq!(ask("cup".into()), (MOST_QUERIES + 2, MOST_QUERIES));
         assert_eq!(ask("mug".into()), (MOST_QUERIES + 3, MOST_QUERIES));
-        assert!(recent.entry("pen", |_| Err(())).is_err());
+        assert!(recent.entry(("pen", false), |_| Err(())).is_err());
     }
 
     #[test]

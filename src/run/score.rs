@@ -9,7 +9,7 @@ use crate::pass::metrics;
 use crate::progress::Progress;
 use crate::query::instances::Places;
 use crate::query::select::select;
-use crate::query::{QueryOptions, QueryResult, TextQuery, answer_all, field_relevancy};
+use crate::query::{CanonicalCosines, QueryOptions, QueryResult, TextQuery, answer_all};
 use crate::scene::{Camera, LanguageField, RgbImage, Splats};
 
 /// Queries of an evaluation.
@@ -43,7 +43,9 @@ pub fn score_field(
     visit: &mut dyn FnMut(&TruthFrame, &DecodedFrame) -> Result<()>,
 ) -> Result<EvalReport> {
     let labels: Vec<u32> = evaluation.phrases().into_iter().map(|p| p.0).collect();
-    let relevancy = queries.iter().map(|q| field_relevancy(field, q)).collect::<Result<Vec<_>>>()?;
+    let relevancy_of =
+        |q: &TextQuery| CanonicalCosines::new(field, &q.canonicals).relevancy(field, q, &options);
+    let relevancy = queries.iter().map(relevancy_of).collect::<Result<Vec<_>>>()?;
     let places = Places::of(splats, field);
     let instances = |relevancy: &Vec<Vec<f32>>| {
         let selection = select(&places, relevancy, &options);

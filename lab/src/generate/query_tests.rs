@@ -3,7 +3,7 @@ use super::regions;
 use splatvk::infer::things;
 use splatvk::query::maps::CodeMaps;
 use splatvk::query::presence::*;
-use splatvk::query::{CanonicalCosines, TextQuery, field_relevancy};
+use splatvk::query::{CanonicalCosines, QueryOptions, TextQuery};
 use splatvk::scene::{Codebook, Image, LanguageField, LevelField};
 use splatvk_test_support::embedding::{DIM, text_embedding};
 
@@ -77,15 +77,21 @@ fn named_colour_separates_similar_things() {
     let level = LevelField { codebook, ..LevelField::default() };
     let field = LanguageField { levels: vec![level], ..LanguageField::default() };
     // Relevancy without and with the same thing in other colours as alternatives.
-    let relevancies = |text: &str| {
+    let relevancies = |text: &str, published: bool| {
+        let options = QueryOptions { published, ..QueryOptions::default() };
         let with = regions::query(text);
         let without = TextQuery { alternatives: Alternatives::default(), ..with.clone() };
-        [without, with].map(|q| field_relevancy(&field, &q).unwrap().concat())
+        [without, with].map(|q| {
+            CanonicalCosines::new(&field, &q.canonicals).relevancy(&field, &q, &options).unwrap().concat()
+        })
     };
-    let [without, with] = relevancies("yellow brick");
+    let [without, with] = relevancies("yellow brick", false);
     assert!(without[1] > 0.7 && with[1] == 0.5, "{without:?} {with:?}");
     assert_eq!(without[0], with[0]);
     // No brick is red: bricks of other colours keep their relevancy.
-    let [without, with] = relevancies("red brick");
+    let [without, with] = relevancies("red brick", false);
+    assert_eq!(without, with);
+    // Published protocols have no rule of colours.
+    let [without, with] = relevancies("yellow brick", true);
     assert_eq!(without, with);
 }

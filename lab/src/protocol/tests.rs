@@ -4,6 +4,7 @@ use glam::DVec3;
 use splatvk::eval::{GroundTruth, Split};
 use splatvk::math::Random;
 use splatvk::query::TextQuery;
+use splatvk::query::presence::Alternatives;
 use splatvk::scene::{Codebook, Image, LanguageField, LevelField, Pose};
 
 fn unit(random: &mut Random) -> Vec<f32> {
@@ -31,6 +32,11 @@ fn query(text: &str, random: &mut Random) -> TextQuery {
         text: text.into(),
         embedding: unit(random),
         canonicals: (0..4).flat_map(|_| unit(random)).collect(),
+        // A text with a colour, in other colours: published protocols have no rule of colours.
+        alternatives: Alternatives {
+            colours: (0..2).flat_map(|_| unit(random)).collect(),
+            ..Default::default()
+        },
         ..Default::default()
     }
 }

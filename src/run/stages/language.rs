@@ -62,6 +62,8 @@ pub struct EmbedQueries {
     pub encoder: SharedEncoder,
     /// Texts of the queries.
     pub texts: Vec<String>,
+    /// Whether all words count, as in published protocols.
+    pub verbatim: bool,
 }
 
 impl Stage for EmbedQueries {
@@ -71,13 +73,13 @@ impl Stage for EmbedQueries {
     type Output = Vec<TextQuery>;
 
     fn settings(&self) -> String {
-        format!("{} {:?}", self.encoder.identity(), self.texts)
+        format!("{} {:?} {}", self.encoder.identity(), self.texts, self.verbatim)
     }
 
     fn run(self, (): (), context: &Context) -> Result<Vec<TextQuery>> {
         context.progress.begin("texts", self.texts.len() as u64);
         let queries = self.encoder.with(|e| {
-            let queries = ask::queries(&self.texts, e, false)?;
+            let queries = ask::queries(&self.texts, e, self.verbatim)?;
             for text in &self.texts {
                 if let Some(name) = e.embedding_source(text) {
                     context.progress.inform(&format!("“{text}” embedded by {name}"));

@@ -5,7 +5,7 @@ use super::score::margin;
 pub use super::window::Table;
 use super::window::{AREA, Part, blended, box_rows};
 use super::{
-    MaskRule, QueryOptions, TextQuery, coarsest_good, code_bar, field_relevancy, filter, first_best,
+    CanonicalCosines, MaskRule, QueryOptions, TextQuery, coarsest_good, code_bar, filter, first_best,
 };
 use crate::scene::{Image, LanguageField};
 use crate::{Error, Result};
@@ -62,10 +62,11 @@ pub fn answer(
     query: &TextQuery,
     options: &QueryOptions,
 ) -> Result<QueryResult> {
-    answer_with(codes, &field_relevancy(field, query)?, options)
+    let cosines = CanonicalCosines::new(field, &query.canonicals);
+    answer_with(codes, &cosines.relevancy(field, query, options)?, options)
 }
 
-/// [`answer`] with the relevancy of every code per level ([`field_relevancy`]).
+/// [`answer`] with the relevancy of every code per level ([`CanonicalCosines::relevancy`]).
 pub fn answer_with(
     codes: &[Image<i32>],
     relevancy: &[Vec<f32>],

@@ -54,6 +54,10 @@ pub struct QueryOptions {
     /// slightly better than its whole, although the phrase means the whole. The coarsest level
     /// within the tolerance of the best margin is chosen.
     pub slack: Slack,
+    /// Whether answers are those of the published protocols: every text counts with all its words,
+    /// codes of another colour than the text's keep their relevancy, and presence is not judged, so
+    /// that it empties no mask.
+    pub published: bool,
 }
 
 /// Tolerance by which a coarser level may be worse and is still chosen. Levels are compared by
@@ -88,7 +92,7 @@ pub enum MaskRule {
 
 impl Default for QueryOptions {
     fn default() -> Self {
-        QueryOptions { mask: MaskRule::Codes(CODE_SHARE), abs_threshold: 0.5, slack: SLACK }
+        QueryOptions { mask: MaskRule::Codes(CODE_SHARE), abs_threshold: 0.5, slack: SLACK, published: false }
     }
 }
 

@@ -1,5 +1,5 @@
 //! Relevancy of codes to a text (docs/internals/method.md#relevancy).
-use super::TextQuery;
+use super::{QueryOptions, TextQuery};
 use crate::math::{dot, dot_f32};
 use crate::scene::{Codebook, LanguageField};
 use crate::{Error, Result};
@@ -40,10 +40,30 @@ impl CanonicalCosines {
         self.canonicals == canonicals
     }
 
-    /// [`field_relevancy`], with the canonical phrases of the query.
-    pub fn relevancy(&self, field: &LanguageField, query: &TextQuery) -> Result<Vec<Vec<f32>>> {
-        let levels = field.levels.iter().zip(&self.exact);
-        levels.map(|(level, hardest)| level_relevancy(&level.codebook, query, hardest)).collect()
+    /// [`code_relevancy`] of every level, with the canonical phrases of the query. Unless the
+    /// options ask for a published protocol, codes that fit another colour than the query's are
+    /// limited to 0.5.
+    pub fn relevancy(
+        &self,
+        field: &LanguageField,
+        query: &TextQuery,
+        options: &QueryOptions,
+    ) -> Result<Vec<Vec<f32>>> {
+        let mut levels = self.plain(field, query)?;
+        if !options.published {
+            let books = field.levels.iter().map(|level| &level.codebook);
+            books.zip(&mut levels).for_each(|(book, values)| limit_other_colours(book, query, values));
+        }
+        Ok(levels)
+    }
+
+    fn plain(&self, field: &LanguageField, query: &TextQuery) -> Result<Vec<Vec<f32>>> {
+        let books = field.levels.iter().map(|level| &level.codebook);
+        let level = |(book, hardest): (&Codebook, &Vec<f64>)| {
+            check(book, query)?;
+            Ok(relevancies(book, query, hardest))
+        };
+        books.zip(&self.exact).map(level).collect()
     }
 }
 
@@ -60,7 +80,8 @@ fn hardest<T: Copy + Send + Sync>(
 }
 
 /// Relevancy of every code, [K]: `min_i σ(10 (φ·q − φ·n_i))` (docs/internals/method.md#relevancy).
-/// Answers take [`field_relevancy`], which also limits codes of another colour than the query's.
+/// Answers take [`CanonicalCosines::relevancy`], which also limits codes of another colour than the
+/// query's.
 pub fn code_relevancy(codebook: &Codebook, query: &TextQuery) -> Result<Vec<f32>> {
     check(codebook, query)?;
     Ok(relevancies(codebook, query, &hardest(codebook, &query.canonicals, dot, f64::NEG_INFINITY, f64::max)))
@@ -120,17 +141,9 @@ pub(super) fn margin(relevancy: f32) -> f32 {
     ((r / (1.0 - r)).ln() / LOGIT_SCALE) as f32
 }
 
-/// [`code_relevancy`] of every level; codes that fit another colour than the query's are limited to
-/// 0.5.
+/// [`code_relevancy`] of every level: the relevancy of the published protocols.
 pub fn field_relevancy(field: &LanguageField, query: &TextQuery) -> Result<Vec<Vec<f32>>> {
-    CanonicalCosines::new(field, &query.canonicals).relevancy(field, query)
-}
-
-fn level_relevancy(book: &Codebook, query: &TextQuery, hardest: &[f64]) -> Result<Vec<f32>> {
-    check(book, query)?;
-    let mut relevancy = relevancies(book, query, hardest);
-    limit_other_colours(book, query, &mut relevancy);
-    Ok(relevancy)
+    CanonicalCosines::new(field, &query.canonicals).plain(field, query)
 }
 
 /// Limits codes that fit another colour better to a relevancy of 0.5 if the best code has the
