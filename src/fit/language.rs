@@ -4,7 +4,7 @@
 use super::lift::{CodeTargets, code_length, lift};
 use super::losses::Losses;
 use super::model::{Model, not_finite};
-use super::options::{LanguageOptions, Start};
+use super::options::{FeatureStorage, LanguageOptions, Start};
 use super::photos::Photos;
 use super::scale::SceneScale;
 use super::schedule::ViewOrder;
@@ -118,7 +118,10 @@ pub(crate) fn train_language_of(
         };
         let features = made.features.into_iter().zip(made.reliability);
         for (&level, (features, reliability)) in group.iter().zip(features) {
-            out.field.levels[level].set_features(features);
+            match options.storage {
+                FeatureStorage::Mixes => out.field.levels[level].set_features(features),
+                FeatureStorage::Numbers => out.field.levels[level].set_numbers(features),
+            }
             out.field.levels[level].reliability = reliability;
         }
         match group.as_slice() {
@@ -382,7 +385,7 @@ impl Training for Run<'_> {
         let shares: Vec<String> = LEVEL_NAMES.into_iter().zip(&point.accuracy).filter_map(percent).collect();
         let note = Some(format!("decoded: {}", shares.join(", ")));
         self.curve.push(point);
-        Ok(StepReport { figures, note, finished: self.settled() })
+        Ok(StepReport { figures, note, finished: self.options.stops_early && self.settled() })
     }
 
     fn stage_state(&self) -> StageState {

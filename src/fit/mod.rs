@@ -28,7 +28,7 @@ pub(crate) use language::Run as LanguageRun;
 pub(crate) use language::train_language_of;
 pub use language::{LanguagePoint, TrainedLanguage, decode_accuracy, train_language};
 pub use losses::Losses;
-pub use options::{InitOptions, LanguageOptions, Rates, RgbOptions, Start};
+pub use options::{FeatureStorage, InitOptions, LanguageOptions, Rates, RgbOptions, Start};
 pub(crate) use photos::Photos;
 pub(crate) use rgb::Run as RgbRun;
 pub use rgb::{CurvePoint, FitStats, Trained, fit_rgb, train_rgb};

@@ -3,6 +3,7 @@ use super::losses::Losses;
 use super::pose::PoseOptions;
 use super::schedule::Exponential;
 use crate::preset::Preset;
+use serde::Serialize;
 
 /// Initialisation of splats (docs/internals/method.md#splats-from-points).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -253,6 +254,16 @@ pub enum Start {
     Lifted,
 }
 
+/// Form in which a scene keeps the features of splats (docs/internals/method.md#feature-storage).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FeatureStorage {
+    /// Two codes of the codebook and a share: five bytes.
+    Mixes,
+    /// All numbers of the feature as it is rendered, as in the published methods.
+    Numbers,
+}
+
 /// Options of [`super::train_language`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct LanguageOptions {
@@ -280,8 +291,12 @@ pub struct LanguageOptions {
     /// Whether geometry, opacity and colour stay fixed and only the features are trained.
     pub detach_geometry: bool,
     /// Interval of measurements of the decode accuracy, steps; 0 = never. It is also measured after
-    /// the last step. Training stops when it gains less than 0.1 % in two measurements.
+    /// the last step.
     pub check_every: usize,
+    /// Whether training stops when the decode accuracy gains less than 0.1 % in two measurements.
+    pub stops_early: bool,
+    /// Form in which the features are kept.
+    pub storage: FeatureStorage,
 }
 
 impl LanguageOptions {
@@ -317,6 +332,8 @@ impl LanguageOptions {
             detach_geometry: false,
             // A measurement costs as much as three steps.
             check_every: if preset == Preset::Draft { iterations } else { (iterations / 4).min(50) },
+            stops_early: !paper,
+            storage: FeatureStorage::Mixes,
         }
     }
 }
@@ -342,6 +359,13 @@ mod tests {
         limited.limit_splats(120_000);
         assert_eq!(limited.most_splats(), 120_000);
         assert!(limited.init.max_points >= 80_000);
+    }
+
+    #[test]
+    fn paper_trains_language_to_its_end() {
+        let options = LanguageOptions::preset(Preset::Paper);
+        assert_eq!((options.iterations, options.start, options.stops_early), (1000, Start::Zero, false));
+        assert!(LanguageOptions::preset(Preset::Default).stops_early);
     }
 
     #[test]

@@ -9,7 +9,7 @@ use super::sources::{
 };
 #[cfg(feature = "cli")]
 pub use super::whole::whole;
-use crate::fit::Preset;
+use crate::fit::{FeatureStorage, Preset};
 use crate::infer::installed::Inventory;
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
@@ -238,8 +238,11 @@ impl LanguageConfig {
     /// The choices of the method, with the code length and the alignment of this configuration.
     pub fn recipe(&self, preset: Option<Preset>) -> Recipe {
         let recipe = self.method(preset).recipe;
-        let align = self.compat.map_or(recipe.align, |c| c.align);
-        Recipe { feature_dim: self.feature_dim(preset), align, ..recipe }
+        let (align, storage) = match self.compat {
+            Some(compat) => (compat.align, FeatureStorage::Numbers),
+            None => (recipe.align, recipe.storage),
+        };
+        Recipe { feature_dim: self.feature_dim(preset), align, storage, ..recipe }
     }
 
     /// Prompts of a mask network.

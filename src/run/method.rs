@@ -2,7 +2,9 @@
 //! and every pass with the default, and changes only the authors' treatment of language.
 use super::view::Viewer;
 use crate::fit::scale::SceneScale;
-use crate::fit::{self, LanguageOptions, Photos, Preset, RgbOptions, Start, TrainedLanguage, index_head};
+use crate::fit::{
+    self, FeatureStorage, LanguageOptions, Photos, Preset, RgbOptions, Start, TrainedLanguage, index_head,
+};
 use crate::gpu::Device;
 use crate::language::align::AlignOptions;
 use crate::language::{BuildOptions, Reducer};
@@ -94,9 +96,16 @@ const OURS: Recipe = Recipe {
     language: LanguageFit::Train,
     index_head: false,
     align: AlignOptions::DEFAULT,
+    storage: FeatureStorage::Mixes,
 };
 
-const UNALIGNED: Recipe = Recipe { steps: [false; 3], image_weight: 0.0, features_only: true, ..OURS };
+const UNALIGNED: Recipe = Recipe {
+    steps: [false; 3],
+    image_weight: 0.0,
+    features_only: true,
+    storage: FeatureStorage::Numbers,
+    ..OURS
+};
 
 /// Choices of a method.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -119,6 +128,8 @@ pub struct Recipe {
     pub index_head: bool,
     /// Thresholds and conditions of the alignment; `steps` disables the ones that a method lacks.
     pub align: AlignOptions,
+    /// Form in which a scene keeps the features.
+    pub storage: FeatureStorage,
 }
 
 impl Method {
@@ -199,6 +210,7 @@ impl Recipe {
     fn language(&self, mut options: LanguageOptions) -> LanguageOptions {
         options.image_weight = self.image_weight;
         options.detach_geometry |= self.features_only;
+        options.storage = self.storage;
         if matches!(self.reducer, Reducer::Autoencoder { .. }) {
             // Decoding every training pixel against 2048 directions takes longer on the CPU than
             // the training.
@@ -260,7 +272,82 @@ fn train_index_heads(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::format::scene_dir::{self, Contents};
+    use crate::gpu::test_device;
+    use crate::progress::Silent;
     use crate::run::LanguageConfig;
+    use crate::scene::{Codebook, Image, LevelField, RgbImage, Seen, World, seeded};
+
+    /// A wall of 300 splats seen by one camera, with columns of three labels.
+    fn labelled(code_dim: usize) -> (Splats, Camera, RgbImage, LanguageField) {
+        let (width, height) = (75, 53);
+        let (splats, camera) = seeded::small(300, width, height, 0, 3);
+        let (width, height) = (width as usize, height as usize);
+        let image = RgbImage { width, height, data: vec![[0.5; 3]; width * height] };
+        let code = |k: usize| (0..code_dim).map(move |i| f32::from(u8::from(i == k)));
+        let level = LevelField {
+            codebook: Codebook {
+                embedding_dim: 1,
+                code_dim,
+                embeddings: vec![1.0; 3],
+                codes: (0..3).flat_map(code).collect(),
+                weights: vec![1.0; 3],
+                members: vec![Vec::new(); 3],
+                min_chord: 1.0,
+            },
+            targets: vec![Image {
+                width,
+                height,
+                data: (0..width * height).map(|p| (p / 9 % 3) as i32).collect(),
+            }],
+            ..LevelField::default()
+        };
+        (
+            splats,
+            camera,
+            image,
+            LanguageField {
+                levels: vec![level, LevelField::default(), LevelField::default()],
+                space: "test".into(),
+            },
+        )
+    }
+
+    /// A scene on disk has the features that were scored, and a baseline those of its authors.
+    #[test]
+    fn baseline_is_stored_as_trained() {
+        let device = test_device();
+        for method in METHODS {
+            let recipe = method.recipe;
+            let (splats, camera, image, field) = labelled(recipe.feature_dim);
+            let photos = Photos {
+                images: std::slice::from_ref(&image),
+                cameras: std::slice::from_ref(&camera),
+                depths: None,
+                coverage: &[],
+            };
+            let options = LanguageOptions { iterations: 3, ..LanguageOptions::preset(Preset::Draft) };
+            let trained = recipe.train_language(&device, photos, &splats, field, options, &Silent).unwrap();
+            let level = &trained.field.levels[0];
+            assert_eq!(level.mixes.is_empty(), recipe.storage == FeatureStorage::Numbers, "{}", method.name);
+            let folder = tempfile::tempdir().unwrap();
+            let contents = Contents {
+                splats: &trained.splats,
+                seen: &Seen::default(),
+                backdrop: &Splats::default(),
+                cameras: std::slice::from_ref(&camera),
+                world: &World::default(),
+                photos: &[],
+                points: None,
+                language: Some(&trained.field),
+                text_embeddings: None,
+            };
+            scene_dir::write(folder.path(), &contents).unwrap();
+            let loaded = scene_dir::load(folder.path()).unwrap().language.unwrap();
+            assert_eq!(loaded.levels[0].features, level.features, "{}", method.name);
+            assert_eq!(loaded.levels[0].codebook.codes, level.codebook.codes, "{}", method.name);
+        }
+    }
 
     #[test]
     fn training_settings_select_trained_method() {

@@ -106,6 +106,11 @@ impl LevelField {
         self.splats.as_ref().unwrap_or(shared)
     }
 
+    /// Stores features [N, d] as they are rendered.
+    pub fn set_numbers(&mut self, features: Vec<f32>) {
+        (self.features, self.mixes) = (features, Vec::new());
+    }
+
     /// Stores features [N, d] of any length: as unit mixes of two codes, or unchanged where a mix
     /// cannot index the codes.
     pub fn set_features(&mut self, features: Vec<f32>) {
