@@ -12,8 +12,9 @@ use crate::pass::raster_forward::{Cutoffs, ReferenceScene};
 use crate::pass::reference::{self, Forward};
 use crate::pass::{
     DeviceChoices, FeatureMode, GradientReduction, RasterOptions, Rasterizer, ShGradientKernel, SplatBuffers,
-    TileBinning, TileSums, View,
+    TileBinning, TileSums, View, raster_backward,
     regularise::{self, RatioPenalty},
+    screen_gradients,
 };
 use crate::scene::Splats;
 use crate::scene::seeded;
@@ -35,6 +36,7 @@ pub(super) const CASES: &[Case] = &[
     case("gradients of SH", Some(KernelVariant::ShShared), |d| sh_gradients(d, ShGradientKernel::Shared)),
     case("projection backward with Adam", Some(KernelVariant::FusedUpdate), update),
     case("depth and needle losses", None, regularisers),
+    case("gradients on the screen", None, screen_gradients),
 ];
 
 /// Image size in pixels, no multiple of the tile size.
@@ -318,4 +320,39 @@ fn regularisers(device: &Device) -> Found {
         [3, 4 + FEATURES].iter().all(|k| upstream[k * pixels..(k + 1) * pixels].iter().all(|g| *g == 0.0));
     let cleared = if zero { Ok(0.0) } else { Err("the depth gradient was not cleared".to_owned()) };
     Ok(worst([depth, alpha, scale, cleared]))
+}
+
+fn screen_gradients(device: &Device) -> Found {
+    let scene = Scene::new(0);
+    let (params, raster) = scene.rendered(device, DeviceChoices::of(device))?;
+    let frame = raster.frame();
+    let mut random = Random::new(15);
+    let values = 5 * (SIZE[0] * SIZE[1]) as usize;
+    let upstream: Vec<f32> = (0..values).map(|_| random.scaled_normal(1.0) as f32).collect();
+    frame.planes_grad.write(&upstream)?;
+    let sums = device.buffer_from("sums", &vec![1.0f32; 2 * params.count])?;
+    let mut rec = Recorder::new(device, "self-check of the gradients on the screen");
+    raster.record_band_backward(&mut rec, &params, &scene.options, &frame.bands.get(0));
+    screen_gradients::record(&mut rec, frame, params.count, &sums);
+    rec.run()?;
+    let forward = scene.reference();
+    let reference = ReferenceScene {
+        projected: &forward.projected,
+        features: &[],
+        feature_dim: 0,
+        order: &forward.order,
+        view: &scene.view,
+    };
+    let upstream: Vec<f64> = upstream.iter().map(|&g| g.into()).collect();
+    let gradients = raster_backward::reference(&reference, &Cutoffs::STANDARD, &upstream);
+    let expected: Vec<f64> = forward
+        .projected
+        .iter()
+        .zip(&gradients.geometry)
+        .flat_map(|(projected, gradient)| match projected {
+            Some(projected) => [1.0 + screen_gradients::reference(projected, gradient, SIZE), 2.0],
+            None => [1.0, 1.0],
+        })
+        .collect();
+    Ok(worst([close("sums", &sums.read()?, &expected, &gradient_tolerance(&expected))]))
 }

@@ -388,12 +388,13 @@ impl Training for Run<'_> {
         Ok(StepReport { figures, note, finished: self.options.stops_early && self.settled() })
     }
 
-    fn stage_state(&self) -> StageState {
-        StageState { recent: self.recent.clone(), curve: self.curve.clone() }
+    fn stage_state(&self) -> Result<StageState> {
+        Ok(StageState { recent: self.recent.clone(), curve: self.curve.clone() })
     }
 
-    fn set_stage_state(&mut self, kept: StageState) {
+    fn set_stage_state(&mut self, kept: StageState) -> Result<()> {
         (self.recent, self.curve) = (kept.recent, kept.curve);
+        Ok(())
     }
 }
 

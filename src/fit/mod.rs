@@ -2,6 +2,7 @@
 mod added;
 mod bounds;
 mod degree_trials;
+mod densify;
 pub mod index_head;
 pub mod init;
 mod language;
@@ -24,6 +25,7 @@ mod virtual_views;
 pub use crate::preset::Preset;
 pub use added::new_surface;
 pub(crate) use added::train_on;
+pub use densify::DensifyOptions;
 pub(crate) use language::Run as LanguageRun;
 pub(crate) use language::train_language_of;
 pub use language::{LanguagePoint, TrainedLanguage, decode_accuracy, train_language};

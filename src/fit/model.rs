@@ -221,8 +221,18 @@ impl Model {
         if rows.len() == self.count() {
             return Ok(false);
         }
-        let (device, n) = (&self.device, rows.len());
-        let index = device.buffer_from("kept rows", rows)?;
+        self.replace(rows, &[])?;
+        Ok(true)
+    }
+
+    /// Keeps the given rows with their optimiser state, and appends copies of the `added` rows
+    /// without one. Features and their moments are reset. Splats that no photo shows stay last, so
+    /// that none is added to a model with such.
+    pub(super) fn replace(&mut self, kept: &[u32], added: &[u32]) -> Result<()> {
+        debug_assert!(added.is_empty() || self.unseen.is_empty());
+        let (device, rows) = (&self.device, [kept, added].concat());
+        let n = rows.len();
+        let index = device.buffer_from("kept rows", &rows)?;
         let (degree, dim) = (self.values.sh_degree, self.values.feature_dim);
         let mut values = SplatBuffers::zeros(device, "splats", n, degree, dim)?;
         values.antialiased = self.values.antialiased;
@@ -232,15 +242,18 @@ impl Model {
                 compact::gather(device, "kept splats", buffer(&self.values, kind), &index, n, w)?;
             let moments = &mut self.moments[kind as usize];
             moments.buffer = compact::gather(device, "adam moments", &moments.buffer, &index, n, 2 * w)?;
+            if !added.is_empty() {
+                moments.buffer.write_at(2 * w * kept.len(), &vec![0.0; 2 * w * added.len()])?;
+            }
         }
         self.feature_moments = Moments::new(device, n * dim)?;
         self.gradients = gradients_of(device, &values)?;
         self.feature_gradients = device.buffer::<f32>("gradient features", (n * dim).max(4))?;
         let first = self.first_unseen();
-        let last = rows.iter().filter_map(|row| (*row as usize).checked_sub(first));
+        let last = kept.iter().filter_map(|row| (*row as usize).checked_sub(first));
         self.unseen = last.map(|row| self.unseen[row]).collect();
         self.values = values;
-        Ok(true)
+        Ok(())
     }
 
     /// Copies the splats to the host.

@@ -1,4 +1,5 @@
 //! Options of the training stages, and their presets.
+use super::densify::DensifyOptions;
 use super::losses::Losses;
 use super::pose::PoseOptions;
 use super::schedule::Exponential;
@@ -95,6 +96,8 @@ pub struct RgbOptions {
     pub prune_every: usize,
     /// First step of pruning.
     pub prune_from: usize,
+    /// Density control; `None` = off. Not for options with a margin.
+    pub densify: Option<DensifyOptions>,
     /// Camera refinement; `None` = off.
     pub poses: Option<PoseOptions>,
     /// Interval of points of the loss curve, steps.
@@ -126,14 +129,16 @@ impl RgbOptions {
 
     /// Most splats, of surfaces that photos show and of continued ones.
     pub fn most_splats(&self) -> usize {
-        self.init.max_points + if self.margin > 0.0 { self.most_unseen } else { 0 }
+        let growth = self.densify.map_or(1, |densify| densify.growth);
+        growth * self.init.max_points + if self.margin > 0.0 { self.most_unseen } else { 0 }
     }
 
     /// Limits the number of splats to `most`.
     pub fn limit_splats(&mut self, most: usize) {
         self.most_unseen = self.most_unseen.min(most / 3);
         let shown = most - if self.margin > 0.0 { self.most_unseen } else { 0 };
-        self.init.max_points = self.init.max_points.min(shown);
+        let growth = self.densify.map_or(1, |densify| densify.growth);
+        self.init.max_points = self.init.max_points.min(shown / growth);
     }
 
     /// These options for another number of steps; schedules end with the run.
@@ -201,6 +206,7 @@ impl RgbOptions {
             min_confidence: 0.5,
             virtual_views: 12,
             bounded: true,
+            densify: None,
             poses: Some(PoseOptions {
                 start: (iterations / 10).min(100),
                 rate: Exponential { start: 1e-4, end: 1e-6, steps: iterations },
@@ -238,6 +244,7 @@ impl RgbOptions {
             prune_opacity: 0.005,
             prune_every: 100,
             prune_from: 200,
+            densify: Some(DensifyOptions::PUBLISHED),
             poses: Some(PoseOptions { start: 0, rate: Exponential { start: 1e-4, end: 1e-6, steps: 1000 } }),
             report_every: 10,
         }

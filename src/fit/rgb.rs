@@ -1,6 +1,7 @@
 //! RGB stage: fits splats, initialised from points, to the photos and refines the cameras
 //! (docs/internals/method.md#splats).
 use super::bounds::Bounds;
+use super::densify::Density;
 use super::init::splats_from_points;
 use super::losses::Losses;
 use super::model::Model;
@@ -218,6 +219,7 @@ pub(crate) struct Run<'a> {
     scale: SceneScale,
     photos: Photos<'a>,
     bounds: Option<Bounds>,
+    density: Option<Density>,
     poses: Vec<PoseAdam>,
     /// Losses since the last report.
     recent: Vec<StepLoss>,
@@ -243,6 +245,9 @@ pub(crate) struct StageState {
     last: (usize, bool),
     psnr: Vec<Option<f64>>,
     curve: Vec<CurvePoint>,
+    /// Sums of [`Density`]; empty without density control.
+    #[serde(default)]
+    density: Vec<f32>,
 }
 
 impl<'a> Run<'a> {
@@ -264,7 +269,10 @@ impl<'a> Run<'a> {
         if !virtual_views.images.is_empty() {
             groups.push((virtual_views.photos(), &Losses::VIRTUAL));
         }
-        let views = Views::new(device, &groups, confidence, start.len(), 0, scale.near())?;
+        let growth = options.densify.map_or(1, |densify| densify.growth);
+        let views = Views::new(device, &groups, confidence, growth * start.len(), 0, scale.near())?;
+        let density =
+            options.densify.map(|densify| Density::new(device, densify, start.len())).transpose()?;
         let model = Model::new(device, start, 0)?;
         let order = ViewOrder::new(photos.cameras.len(), virtual_views.cameras.len(), options.seed);
         let cameras = [photos.cameras, &virtual_views.cameras].concat();
@@ -274,6 +282,7 @@ impl<'a> Run<'a> {
             options,
             scale,
             photos,
+            density,
             bounds: options.bounded.then(|| Bounds::new(photos.cameras, &start.means)),
             poses: vec![PoseAdam::default(); photos.cameras.len()],
             recent: Vec::new(),
@@ -344,9 +353,31 @@ impl<'a> Run<'a> {
             )));
         }
         if model.keep(&rows)? {
-            self.trainer.forget_recordings();
+            self.forget_density()?;
         }
         self.clamp_to_bounds()
+    }
+
+    /// Lets splats grow where that is due.
+    fn densify(&mut self, step: usize) -> Result<()> {
+        let (t, extent) = (&mut self.trainer, self.scale.extent);
+        match &self.density {
+            Some(density) if density.is_due(step, self.options.iterations) => {
+                density.grow(&mut t.model, extent, self.options.seed ^ (step as u64) << 32)?;
+                self.forget_density()
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Drops the recordings, and the sums of rows that have moved.
+    fn forget_density(&mut self) -> Result<()> {
+        self.trainer.forget_recordings();
+        let count = self.trainer.model.count();
+        match &mut self.density {
+            Some(density) => density.reset(&self.trainer.device, count),
+            None => Ok(()),
+        }
     }
 
     /// Clamps the splats to the bounds, if there are any.
@@ -414,6 +445,9 @@ impl Training for Run<'_> {
             self.losses(view).record_image(&mut rec, views, item, &band);
             rasterizer.record_band_backward(&mut rec, &model.values, raster, &band);
         }
+        if let Some(density) = &self.density {
+            density.record(&mut rec, frame, model.count());
+        }
         let needles = self.losses(view).ratio_penalty(model.count());
         model.record_update(&mut rec, rasterizer, raster, needles);
         rec.download(&frame.status);
@@ -450,23 +484,30 @@ impl Training for Run<'_> {
             report.figures = vec![("loss", loss), ("psnr", psnr), ("splats", splats as f64)];
             report.figures.extend(ssim.map(|ssim| ("ssim", ssim)));
         }
+        self.densify(step)?;
         self.prune(step)?;
         Ok(report)
     }
 
-    fn stage_state(&self) -> StageState {
-        let Run { poses, recent, last, psnr, curve, .. } = self;
-        StageState {
+    fn stage_state(&self) -> Result<StageState> {
+        let Run { poses, recent, last, psnr, curve, density, trainer, .. } = self;
+        let sums = density.as_ref().map(|density| density.state(trainer.model.count()));
+        Ok(StageState {
             poses: poses.clone(),
             recent: recent.clone(),
             last: *last,
             psnr: psnr.clone(),
             curve: curve.clone(),
-        }
+            density: sums.transpose()?.unwrap_or_default(),
+        })
     }
 
-    fn set_stage_state(&mut self, kept: StageState) {
+    fn set_stage_state(&mut self, kept: StageState) -> Result<()> {
         (self.poses, self.recent, self.last) = (kept.poses, kept.recent, kept.last);
         (self.psnr, self.curve) = (kept.psnr, kept.curve);
+        match &mut self.density {
+            Some(density) => density.restore(&self.trainer.device, &kept.density),
+            None => Ok(()),
+        }
     }
 }

@@ -41,8 +41,8 @@ pub(crate) trait Training {
     fn read_back(&mut self, view: usize, iteration: usize) -> Result<()>;
     /// Measures and prunes after `step` steps, where that is due.
     fn review(&mut self, step: usize) -> Result<StepReport>;
-    fn stage_state(&self) -> Self::StageState;
-    fn set_stage_state(&mut self, state: Self::StageState);
+    fn stage_state(&self) -> Result<Self::StageState>;
+    fn set_stage_state(&mut self, state: Self::StageState) -> Result<()>;
 
     /// One step on the next view.
     fn step(&mut self, iteration: usize) -> Result<()> {
@@ -186,7 +186,7 @@ pub(super) fn train<T: Training>(
 fn save<T: Training>(run: &T, done: usize, progress: &dyn Progress) -> Result<()> {
     let Some(checkpoint) = progress.checkpoint() else { return Ok(()) };
     let Trainer { group, model, cameras, order, .. } = run.trainer();
-    let (model, stage) = (model.state()?, run.stage_state());
+    let (model, stage) = (model.state()?, run.stage_state()?);
     let state = State { group: *group, done, model, cameras: cameras.clone(), order: order.clone(), stage };
     checkpoint.save(done, &state)
 }
@@ -198,7 +198,7 @@ fn restore<T: Training>(run: &mut T, progress: &dyn Progress) -> Result<usize> {
     let trainer = run.trainer_mut();
     trainer.model = Model::restored(&trainer.device, &kept.model)?;
     (trainer.cameras, trainer.order) = (kept.cameras, kept.order);
-    run.set_stage_state(kept.stage);
+    run.set_stage_state(kept.stage)?;
     progress.checkpoint().iter().for_each(|c| c.went_on_from(kept.done));
     Ok(kept.done)
 }
@@ -209,7 +209,7 @@ mod tests {
     use crate::fit::losses::Losses;
     use crate::fit::rgb::fit_photos;
     use crate::fit::{
-        LanguageOptions, LanguageRun, Photos, Preset, RgbOptions, RgbRun, pose::PoseOptions,
+        DensifyOptions, LanguageOptions, LanguageRun, Photos, Preset, RgbOptions, RgbRun, pose::PoseOptions,
         scale::SceneScale, schedule::Exponential,
     };
     use crate::gpu::{Device, KernelVariant, Options, TestDevice};
@@ -422,23 +422,32 @@ mod tests {
         }
     }
 
+    /// With splats that grow between checkpoint and end, by sums from before the checkpoint.
     #[test]
     fn resumed_training_has_the_same_bits() {
-        let (device, options) = (device(false), colour_options());
+        let device = device(false);
         let (splats, cameras, images) = scene();
         let scale = SceneScale::measure(&cameras, &splats.means);
         let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
-        let new = || RgbRun::new(&device, photos, &splats, scale, &options).unwrap();
-        let folder = tempfile::tempdir().unwrap();
-        let progress = CheckpointOnly(Checkpoint::new(folder.path().join("state"), Duration::ZERO, true));
-        let (mut whole, mut resumed) = (new(), new());
-        (0..COUNTED).for_each(|iteration| whole.step(iteration).unwrap());
-        save(&whole, COUNTED, &progress).unwrap();
-        assert_eq!(restore(&mut resumed, &progress).unwrap(), COUNTED);
-        let [a, b] = [&mut whole, &mut resumed].map(|run| {
-            (COUNTED..2 * COUNTED).for_each(|iteration| run.step(iteration).unwrap());
-            (run.trainer().step_resources().params.download().unwrap(), run.trainer().cameras.clone())
-        });
-        assert!(a == b, "other bits");
+        let growing = DensifyOptions { every: COUNTED + 4, gradient: 1e-6, ..DensifyOptions::PUBLISHED };
+        for densify in [None, Some(growing)] {
+            let options = RgbOptions { densify, ..colour_options() };
+            let new = || RgbRun::new(&device, photos, &splats, scale, &options).unwrap();
+            let folder = tempfile::tempdir().unwrap();
+            let progress = CheckpointOnly(Checkpoint::new(folder.path().join("state"), Duration::ZERO, true));
+            let (mut whole, mut resumed) = (new(), new());
+            (0..COUNTED).for_each(|iteration| whole.step(iteration).unwrap());
+            save(&whole, COUNTED, &progress).unwrap();
+            assert_eq!(restore(&mut resumed, &progress).unwrap(), COUNTED);
+            let [a, b] = [&mut whole, &mut resumed].map(|run| {
+                for iteration in COUNTED..2 * COUNTED {
+                    run.step(iteration).unwrap();
+                    run.review(iteration + 1).unwrap();
+                }
+                (run.trainer().step_resources().params.download().unwrap(), run.trainer().cameras.clone())
+            });
+            assert!(a == b, "other bits");
+            assert_eq!(a.0.0.len() > splats.len(), densify.is_some(), "{} splats", a.0.0.len());
+        }
     }
 }

@@ -28,6 +28,7 @@ pub mod reference;
 pub mod regularise;
 pub mod renderer;
 pub mod scan;
+pub mod screen_gradients;
 pub mod sort;
 pub mod splat_buffers;
 pub mod ssim_l1;
