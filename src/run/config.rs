@@ -4,6 +4,7 @@
 //! and `run.json` stores them. Photos, files and machine are apart from it (`run::plan`).
 use super::compat::{self, Compat};
 use super::method::{Method, Recipe};
+use super::paper::{self, PaperSources};
 use super::sources::{
     self, DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind,
 };
@@ -116,6 +117,13 @@ pub struct LanguageConfig {
     /// level and mask of answers
     #[cfg_attr(feature = "cli", arg(long, value_parser = arguments::compat(), default_value = compat::NONE, hide_default_value = true, value_name = "WHOSE", help_heading = EXPERTS))]
     pub compat: CompatChoice,
+    /// The paper's method as published: --preset paper (1000 steps with pruning and density control,
+    /// then 1000 per level from zero), --compat paper, and only the paper's networks
+    #[cfg_attr(feature = "cli", arg(long, conflicts_with_all = ["method", "feature_dim", "iterations", "language_iterations"], help_heading = EXPERTS))]
+    pub paper: bool,
+    /// Networks with --paper
+    #[cfg_attr(feature = "cli", arg(long, value_enum, default_value_t, hide_default_value = true, requires = "paper", value_name = "WHICH", help_heading = EXPERTS))]
+    pub paper_sources: PaperSources,
 }
 
 /// The choices of another implementation that are reproduced, if any.
@@ -164,6 +172,8 @@ impl Default for LanguageConfig {
             method: None,
             per_level: false,
             compat: None,
+            paper: false,
+            paper_sources: PaperSources::Own,
         }
     }
 }
@@ -175,6 +185,9 @@ impl ReconstructionConfig {
     /// # Errors
     /// Unknown sources, files that do not exist, and settings that contradict each other.
     pub fn resolved(mut self, installed: &Inventory) -> Result<ReconstructionConfig> {
+        if let Some(language) = self.language.as_mut().filter(|language| language.paper) {
+            paper::apply(&mut self.geometry, &mut self.training, language, installed)?;
+        }
         let GeometryConfig { init, depth_prior } = &mut self.geometry;
         resolve::<GeometrySources>(init, installed)?;
         // A geometry network gives depth itself.

@@ -16,6 +16,7 @@ pub mod method;
 pub mod metric;
 mod networks;
 mod outcome;
+pub mod paper;
 pub mod path;
 mod photos;
 mod plan;

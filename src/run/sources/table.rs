@@ -192,8 +192,8 @@ pub fn default<K: SourceKind>() -> SourceChoice {
     K::SOURCES.first().map_or_else(|| SourceChoice::named(""), |s| SourceChoice::named(s.name))
 }
 
-/// Parses a choice: `auto`, an entry of the table, or the name or family of a network of the
-/// catalogue, installed or not. Files and folders must exist.
+/// Parses a choice: `auto`, an entry of the table, the name of an installed network, or the name or
+/// family of one of the catalogue. Files and folders must exist.
 pub fn choose<K: SourceKind>(text: &str, networks: &Inventory) -> Result<SourceChoice> {
     if text == "auto" {
         let best = networks.best(K::TASK).map(|model| SourceChoice::named(&model.name));
@@ -201,7 +201,8 @@ pub fn choose<K: SourceKind>(text: &str, networks: &Inventory) -> Result<SourceC
     }
     let (name, argument) = text.split_once(':').map_or((text, None), |(name, path)| (name, Some(path)));
     let source = K::SOURCES.iter().find(|s| s.name == name);
-    let is_network = || catalogue().iter().any(|k| k.does(K::TASK) && (k.family == name || k.id == name));
+    let is_installed = || networks.models.iter().any(|m| m.tasks.contains(&K::TASK) && m.name == name);
+    let is_known = || catalogue().iter().any(|k| k.does(K::TASK) && (k.family == name || k.id == name));
     match (source.map(|s| s.argument), argument) {
         (Some(None), None) => Ok(SourceChoice::named(name)),
         (Some(Some(_)), Some(path)) if !path.is_empty() && Path::new(path).exists() => {
@@ -210,7 +211,7 @@ pub fn choose<K: SourceKind>(text: &str, networks: &Inventory) -> Result<SourceC
         (Some(Some(_)), Some(path)) if !path.is_empty() => {
             Err(Error::input(format!("--{}: {path} does not exist; check the path", K::OPTION)))
         }
-        (None, None) if is_network() => Ok(SourceChoice::named(name)),
+        (None, None) if is_known() || is_installed() => Ok(SourceChoice::named(name)),
         _ => {
             let own = K::SOURCES.iter().map(Source::syntax);
             let choices: Vec<String> = std::iter::once("auto".to_owned()).chain(own).collect();
