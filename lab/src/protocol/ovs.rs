@@ -1,5 +1,5 @@
-//! 3D-OVS (docs/internals/method.md#3d-ovs): the paper's rule, the rule of the authors' script, and
-//! the data set's own argmax.
+//! 3D-OVS (docs/internals/method.md#3d-ovs): the paper's rule, the same on normalised maps, the rule
+//! of the authors' script, and the data set's own argmax.
 use super::labels::{Labels, numbered, paint};
 use super::score::{
     DecodedView, LabelledView, Masks, OwnLabels, Protocol, ProtocolKind, ProtocolReport, Score,
@@ -16,17 +16,20 @@ use std::sync::Arc;
 
 /// τ of the paper: minimum relevancy of a pixel of the answer.
 const TAU: f32 = 0.8;
-/// Minimum mask of a level that may answer, pixels (paper).
+/// Minimum mask of a level that may answer, pixels of [`FULL_SIZE`] (paper).
 const AREA: usize = 2000;
+/// Pixels of the maps that the areas refer to: LangSplat reduces the photos to a height of 1080.
+const FULL_SIZE: usize = 1440 * 1080;
 /// Threshold if no level passes: share of the maximum of the best level.
 const SUBSTITUTE: f32 = 0.95;
 /// Threshold of the authors' script: share of the maximal cosine (its default; per scene .75 to
 /// .95).
 const BAR: f32 = 0.85;
-/// Minimum mask in the authors' script, pixels.
+/// Minimum mask in the authors' script, pixels of [`FULL_SIZE`].
 const AUTHORS_AREA: usize = 3000;
 
 const PAPER: &str = "paper";
+const NORMALISED: &str = "normalised";
 const AUTHORS: &str = "authors";
 const ARGMAX: &str = "argmax";
 
@@ -164,18 +167,32 @@ fn area(mask: &Image<bool>) -> usize {
     mask.data.iter().filter(|&&m| m).count()
 }
 
+/// Whether a mask of `pixels` has more than `least` pixels of [`FULL_SIZE`] in a map.
+fn exceeds(pixels: usize, least: usize, map: &Image<f32>) -> bool {
+    pixels * FULL_SIZE > least * map.data.len()
+}
+
+/// A map scaled from its minimum and maximum to 0 and 1; zeros for a map of one value.
+fn normalised(map: &Image<f32>) -> Image<f32> {
+    let low = map.data.iter().copied().fold(f32::INFINITY, f32::min);
+    let range = maximum(map) - low;
+    let scaled = |v: &f32| if range > 0.0 { (v - low) / range } else { 0.0 };
+    Image { width: map.width, height: map.height, data: map.data.iter().map(scaled).collect() }
+}
+
 fn maximum(map: &Image<f32>) -> f32 {
     map.data.iter().copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
 /// Rule of the paper: relevancy above τ per level; of the levels with more than 2000 such pixels,
-/// the one with the highest mean.
-pub(super) fn paper_rule(levels: &[(usize, Image<f32>)]) -> Option<Answer> {
+/// the one with the highest mean. CLIP's relevancy hardly reaches τ; `scaled` applies it to
+/// [`normalised`] maps, as LERF's protocol does with its threshold.
+pub(super) fn paper_rule(levels: &[(usize, Image<f32>)], scaled: bool) -> Option<Answer> {
     let mut best: Option<(f64, Answer)> = None;
     for (level, map) in levels {
-        let mask = threshold(map, TAU);
+        let mask = if scaled { threshold(&normalised(map), TAU) } else { threshold(map, TAU) };
         let pixels = area(&mask);
-        if pixels <= AREA {
+        if !exceeds(pixels, AREA, map) {
             continue;
         }
         let inside = map.data.iter().zip(&mask.data).filter(|(_, m)| **m);
@@ -202,7 +219,7 @@ pub(super) fn authors_rule(levels: &[(usize, Image<f32>)]) -> Option<Answer> {
         let mask = threshold(map, BAR * maximum(map));
         let pixels = area(&mask);
         if best.as_ref().is_none_or(|(n, _)| pixels > *n) {
-            best = Some((pixels, (mask, *level, pixels <= AUTHORS_AREA)));
+            best = Some((pixels, (mask, *level, !exceeds(pixels, AUTHORS_AREA, map))));
         }
     }
     best.map(|(_, answer)| answer)
@@ -242,9 +259,13 @@ impl Protocol for Ovs {
             if BACKGROUND_LABELS.contains(&classes[class].as_str()) {
                 continue;
             }
-            if let Some((mask, level, substituted)) = paper_rule(&decoded.relevancy(class)) {
+            let relevancy = decoded.relevancy(class);
+            if let Some((mask, level, substituted)) = paper_rule(&relevancy, false) {
                 push(class, PAPER, mask_iou(&mask, target)?, Some(level), substituted);
                 masks.push((classes[class].clone(), mask));
+            }
+            if let Some((mask, level, substituted)) = paper_rule(&relevancy, true) {
+                push(class, NORMALISED, mask_iou(&mask, target)?, Some(level), substituted);
             }
             if let Some((mask, level, substituted)) = authors_rule(&decoded.cosine(class)) {
                 push(class, AUTHORS, mask_iou(&mask, target)?, Some(level), substituted);
@@ -260,9 +281,11 @@ impl Protocol for Ovs {
         ProtocolReport {
             protocol: ProtocolKind::Ovs,
             definitions: [
-                "miou (the paper's text): per level relevancy > 0.8; of the levels with more than 2000 such pixels the one \
-                 with the highest mean answers; where none has, relevancy > 0.95 of the best level's maximum (counted in \
-                 `substituted`)",
+                "miou (the paper's text): per level relevancy > 0.8; of the levels with more than 2000 such pixels, of \
+                 1440 x 1080, the one with the highest mean answers; where none has, relevancy > 0.95 of the best level's \
+                 maximum (counted in `substituted`)",
+                "miou_normalised: the same with each level's map scaled from its minimum and maximum to 0 and 1 for the \
+                 threshold of 0.8 (counted in `substituted_normalised`)",
                 "miou_authors (the authors' script): cosine > 0.85 of its maximum on levels m and l, the larger mask",
                 "miou_argmax, accuracy_argmax (3D-OVS): every pixel goes to the class with the highest cosine at any level; \
                  accuracy over pixels that the truth labels",
@@ -281,7 +304,13 @@ impl Protocol for Ovs {
 /// Figures of the scores of one split; `pixels` are those of [`Ovs::pixels`].
 fn figures(scores: &[&Score], pixels: &BTreeMap<&'static str, [u64; 2]>) -> BTreeMap<String, f64> {
     let mut out = BTreeMap::new();
-    for (rule, name) in [(PAPER, "miou"), (AUTHORS, "miou_authors"), (ARGMAX, "miou_argmax")] {
+    let rules = [
+        (PAPER, "miou"),
+        (NORMALISED, "miou_normalised"),
+        (AUTHORS, "miou_authors"),
+        (ARGMAX, "miou_argmax"),
+    ];
+    for (rule, name) in rules {
         let miou = mean(scores.iter().filter(|s| s.rule == rule).map(|s| s.iou));
         out.extend(miou.map(|m| (name.to_string(), m)));
     }
@@ -290,8 +319,10 @@ fn figures(scores: &[&Score], pixels: &BTreeMap<&'static str, [u64; 2]>) -> BTre
         out.insert("accuracy_argmax".into(), *right as f64 / *all as f64);
     }
     out.insert("pairs".into(), scores.iter().filter(|s| s.rule == PAPER).count() as f64);
-    let substituted = scores.iter().filter(|s| s.rule == PAPER && s.substituted).count();
-    out.insert("substituted".into(), substituted as f64);
+    for (rule, name) in [(PAPER, "substituted"), (NORMALISED, "substituted_normalised")] {
+        let substituted = scores.iter().filter(|s| s.rule == rule && s.substituted).count();
+        out.insert(name.into(), substituted as f64);
+    }
     out
 }
 
