@@ -13,9 +13,10 @@ use super::runtime::Tensor;
 use crate::scene::MAX_SIDE;
 use crate::{Error, Result, files};
 
-const BUILT_IN: [(&str, &str); 13] = [
+const BUILT_IN: [(&str, &str); 14] = [
     ("clip", include_str!("adapters/clip.toml")),
     ("lseg", include_str!("adapters/lseg.toml")),
+    ("siglip", include_str!("adapters/siglip.toml")),
     ("sam", include_str!("adapters/sam.toml")),
     ("sam-transformers", include_str!("adapters/sam-transformers.toml")),
     ("sam2", include_str!("adapters/sam2.toml")),
@@ -48,6 +49,30 @@ pub struct ImageSpec {
     /// Resampling filter.
     #[serde(default)]
     pub filter: Filter,
+}
+
+/// Preparation of texts for the tokenizer and the text tower of a family.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TextSpec {
+    /// Number of tokens of the tokenizer, by which it is recognised.
+    pub vocabulary: usize,
+    /// Tokens of a text, if the graph does not fix their number.
+    pub context: usize,
+    /// Id that fills a text up.
+    pub pad: i64,
+    /// Id of the mark at the end of a text.
+    pub end: i64,
+    /// Whether the model was trained on lower-case texts that the tokenizer does not make.
+    #[serde(default)]
+    pub lower: bool,
+    /// Whether texts keep their punctuation.
+    #[serde(default = "default_punctuation")]
+    pub punctuation: bool,
+}
+
+fn default_punctuation() -> bool {
+    true
 }
 
 fn default_multiple() -> usize {
@@ -170,6 +195,8 @@ struct GraphSpec {
     #[serde(default)]
     layouts: BTreeMap<String, String>,
     image: Option<ImageSpec>,
+    #[serde(default)]
+    texts: Vec<TextSpec>,
     #[serde(default)]
     apply: BTreeMap<String, Activation>,
     /// Optional roles of the contract that this model must have.
@@ -326,6 +353,8 @@ pub struct Binding {
     pub ports: BTreeMap<&'static str, Bound>,
     /// Preprocessing of photos.
     pub image: Option<ImageSpec>,
+    /// Preparation of texts, by the tokenizers that may lie beside a text tower.
+    pub texts: Vec<TextSpec>,
     /// Role → activation that the program applies.
     pub apply: BTreeMap<String, Activation>,
     /// Whether a mask decoder adds the padding point to a prompt itself.
@@ -363,6 +392,9 @@ impl GraphSpec {
         spec.confidence_floor = self.confidence_floor.or(spec.confidence_floor);
         spec.pixel_centre = self.pixel_centre.or(spec.pixel_centre);
         spec.image = self.image.clone().or(spec.image);
+        if !self.texts.is_empty() {
+            spec.texts.clone_from(&self.texts);
+        }
         spec
     }
 
@@ -398,6 +430,7 @@ impl GraphSpec {
             family: self.family.clone(),
             ports,
             image: self.image.clone(),
+            texts: self.texts.clone(),
             apply: self.apply.clone(),
             pads: self.pads.unwrap_or_default(),
             confidence_floor: self.confidence_floor,

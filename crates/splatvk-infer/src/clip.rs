@@ -4,8 +4,9 @@
 use std::path::PathBuf;
 
 use rayon::prelude::*;
-use tokenizers::Tokenizer;
+use tokenizers::{ModelWrapper, Tokenizer};
 
+use super::adapter::TextSpec;
 use super::cache::OutputKey;
 use super::classify::{crop, extents};
 use super::contract::Part;
@@ -21,8 +22,6 @@ use crate::{Error, Result};
 
 /// Crops per forward pass: ViT-B/16 takes 0.2 GB for eight, and more are no faster on a CPU.
 const BATCH: usize = 8;
-/// Tokens of a text if the graph does not fix their number: CLIP's context.
-const CONTEXT: usize = 77;
 
 /// Size of CLIP's vocabulary, and the ids that CLIP's tokenizer gives for some texts (open_clip
 /// 3.3, without start and end marks).
@@ -47,6 +46,7 @@ pub struct Clip {
     model: Installed,
     space: String,
     tokenizer: Tokenizer,
+    texts: TextSpec,
     image: Option<Graph>,
     text: Option<Graph>,
     dim: usize,
@@ -77,7 +77,8 @@ impl Clip {
         // The weights define the space: features and texts of other weights are not comparable.
         let space =
             format!("{}:{}", model.family, OutputKey::new("space").model(&visual)?.model(&text)?.short());
-        let mut clip = Clip { model, space, tokenizer, image: None, text: None, dim: 0 };
+        let texts = text_spec(&tokenizer, &text)?;
+        let mut clip = Clip { model, space, tokenizer, texts, image: None, text: None, dim: 0 };
         clip.check_tokens(&text)?;
         clip.dim = match widths.0.or(widths.1) {
             Some(dim) => dim,
@@ -155,7 +156,7 @@ impl Clip {
     pub fn tokens(&self, text: &str) -> Result<Vec<i64>> {
         let encoded = self
             .tokenizer
-            .encode(cleaned(text), true)
+            .encode(prepared(text, &self.texts), true)
             .map_err(|e| Error::input(format!("text {text:?}: {e}")))?;
         let mut ids: Vec<i64> = encoded.get_ids().iter().map(|id| i64::from(*id)).collect();
         let context = self.context();
@@ -169,7 +170,7 @@ impl Clip {
 
     fn context(&self) -> usize {
         let fixed = self.model.graph(Part::TextTower).ok().and_then(|g| g.fixed("tokens", "L"));
-        fixed.unwrap_or(CONTEXT).max(2)
+        fixed.unwrap_or(self.texts.context).max(2)
     }
 
     /// Embeds every region from its own crop on black.
@@ -288,7 +289,7 @@ impl RegionEncoder for Clip {
         for ids in tokens {
             let mask = (0..context).map(|k| i64::from(k < ids.len())).collect();
             let mut ids = ids;
-            ids.resize(context, 0);
+            ids.resize(context, self.texts.pad);
             let shape = || vec![1, context];
             let inputs = vec![("tokens", Input::I64(shape(), ids)), ("mask", Input::I64(shape(), mask))];
             let mut row = graph.run(inputs)?.take("embedding")?.data;
@@ -342,6 +343,50 @@ fn tokenizer(model: &Installed) -> Result<Tokenizer> {
     Ok(tokenizer)
 }
 
+/// Preparation of texts for a tokenizer. Padding, case and end mark are part of a text for some
+/// towers, so that a tokenizer of no known family is refused.
+fn text_spec(tokenizer: &Tokenizer, tower: &GraphFile) -> Result<TextSpec> {
+    let vocabulary = tokenizer.get_vocab_size(true);
+    // A word per id leaves nothing to get wrong.
+    if matches!(tokenizer.get_model(), ModelWrapper::WordLevel(_)) {
+        return Ok(TextSpec { vocabulary, context: 77, pad: 0, end: 0, lower: false, punctuation: true });
+    }
+    let refuse = |reason: String| {
+        Err(Error::missing_model(tower.path.display(), format!("{}: {reason}", tower.path.display())))
+    };
+    let Some(spec) = tower.binding.texts.iter().find(|spec| spec.vocabulary == vocabulary) else {
+        let known: Vec<String> = tower.binding.texts.iter().map(|s| s.vocabulary.to_string()).collect();
+        return refuse(format!(
+            "the tokenizer beside it has {vocabulary} tokens, and a {} text tower one of {}: its padding and case are not \
+             known; state them as `texts` in adapter.toml (docs/use/models.md#adapters)",
+            tower.binding.family,
+            if known.is_empty() { "none that is known".to_owned() } else { known.join(" or ") }
+        ));
+    };
+    let last = tokenizer.encode(prepared("a", spec), true).ok().and_then(|e| e.get_ids().last().copied());
+    if last.map(i64::from) != Some(spec.end) {
+        return refuse(format!(
+            "the tokenizer beside it does not end a text with token {}, as the tower was trained; take tokenizer.json from the \
+             model's own page",
+            spec.end
+        ));
+    }
+    Ok(*spec)
+}
+
+/// A text as the tower was trained on it, for the tokenizer.
+fn prepared(text: &str, spec: &TextSpec) -> String {
+    let mut text = cleaned(text);
+    if spec.lower {
+        text = text.to_lowercase();
+    }
+    if !spec.punctuation {
+        text.retain(|c| !c.is_ascii_punctuation());
+        text = text.split_whitespace().collect::<Vec<_>>().join(" ");
+    }
+    text
+}
+
 /// Cleans a text as CLIP's tokenizer does before it splits words: straightens typographic quotes
 /// (as ftfy) and resolves HTML entities twice. The tokenizer file handles case and white space.
 fn cleaned(text: &str) -> String {
@@ -382,6 +427,52 @@ mod tests {
             rows[0] > rows[2]
         };
         assert_eq!((first_is_red([0, 1]), first_is_red([1, 0])), (true, false));
+    }
+
+    /// A tokenizer of SentencePiece with a mark at the end of a text, as SigLIP's.
+    const UNIGRAM: &str = r#"{"version": "1.0", "truncation": null, "padding": null, "normalizer": null,
+        "added_tokens": [{"id": 1, "content": "</s>", "single_word": false, "lstrip": false, "rstrip": false,
+                          "normalized": false, "special": true}],
+        "pre_tokenizer": {"type": "Whitespace"}, "decoder": null,
+        "post_processor": {"type": "TemplateProcessing", "pair": [],
+            "single": [{"Sequence": {"id": "A", "type_id": 0}}, {"SpecialToken": {"id": "</s>", "type_id": 0}}],
+            "special_tokens": {"</s>": {"id": "</s>", "ids": [1], "tokens": ["</s>"]}}},
+        "model": {"type": "Unigram", "unk_id": 0, "byte_fallback": false,
+                  "vocab": [["[UNK]", 0.0], ["</s>", 0.0], ["a", -1.0], ["red", -1.0]]}}"#;
+
+    #[test]
+    fn unknown_tokenizer_is_refused_unless_described() {
+        let dir = tempfile::tempdir().unwrap();
+        clip_in(dir.path(), [0, 1, 2]);
+        let at = |name: &str| dir.path().join("clip_toy").join(name);
+        std::fs::write(at("tokenizer.json"), UNIGRAM).unwrap();
+        let load = || {
+            let registry = Registry::with(Some(dir.path()), Compute::by(Some("cpu"))).unwrap();
+            Clip::load(registry.installed(Task::Features, "clip").unwrap()).map(|clip| clip.tokens("Red, a!"))
+        };
+        let refused = load().err().unwrap().to_string();
+        assert!(refused.contains("has 4 tokens") && refused.contains("49408"), "{refused}");
+        let describe = |end: u32| {
+            let texts = format!(
+                "{{ vocabulary = 4, context = 8, pad = 1, end = {end}, lower = true, punctuation = false }}"
+            );
+            let graph = format!("[[graph]]\npart = \"text-tower\"\ntexts = [{texts}]\n");
+            let adapter = format!("family = \"clip\"\nuntrained = true\n{graph}");
+            std::fs::write(at("adapter.toml"), adapter).unwrap();
+        };
+        describe(1);
+        assert_eq!(load().unwrap().unwrap(), [3, 2, 1]);
+        describe(2);
+        let refused = load().err().unwrap().to_string();
+        assert!(refused.contains("does not end a text with token 2"), "{refused}");
+    }
+
+    #[test]
+    fn texts_are_prepared_as_trained() {
+        let clip = TextSpec { vocabulary: 9, context: 77, pad: 0, end: 1, lower: false, punctuation: true };
+        let siglip = TextSpec { lower: true, punctuation: false, ..clip };
+        assert_eq!(prepared("It’s a Blue  mug.", &clip), "It's a Blue  mug.");
+        assert_eq!(prepared("It’s a Blue  mug.", &siglip), "its a blue mug");
     }
 
     #[test]
