@@ -226,13 +226,11 @@ fn true_segmentation_scores_in_every_layout() {
     as_lerf(&scene, &root.path().join("lerf_ovs"), "teatime");
     as_ovs(&scene, &root.path().join("3d_ovs"), "bed");
     as_scannet(&scene, &root.path().join("scannet"), "scene0000_00");
-    for (layout, data, paper, least) in [
+    for (layout, data, least) in [
         // LERF's masks are cut from smoothed maps: at this size edges move by much of an object.
-        ("lerf", "lerf_ovs/teatime", 0.7125, 0.6),
-        // No object has the 2000 pixels that the paper's rule demands of a mask, so every answer is
-        // that of the substitute rule.
-        ("3dovs", "3d_ovs/bed", f64::NAN, 0.55),
-        ("scannet", "scannet/scene0000_00", 0.4709, 0.8),
+        ("lerf", "lerf_ovs/teatime", 0.6),
+        ("3dovs", "3d_ovs/bed", 0.55),
+        ("scannet", "scannet/scene0000_00", 0.8),
     ] {
         let out = root.path().join(format!("out-{layout}"));
         let report = ablate(&["feed-forward"], &root.path().join(data), &out);
@@ -251,10 +249,8 @@ fn true_segmentation_scores_in_every_layout() {
             let note = row(&report, label)["note"].as_str().unwrap();
             assert_eq!(note, "not installed: splatvk models fetch lseg");
         }
-        let stated =
-            row(&report, if layout == "lerf" { "sparselgs" } else { "lsm" })["paper"]["mIoU"].as_f64();
-        assert_eq!(stated.is_none(), paper.is_nan());
-        assert!(stated.is_none_or(|v| v == paper), "{layout}: {stated:?}");
+        // The draft preset does not measure what the paper's figures measure.
+        assert_eq!(row(&report, "sparselgs")["paper"], json!({}), "{layout}");
     }
 }
 
@@ -294,7 +290,7 @@ fn driver_runs_available_data_sets() {
     let page = std::fs::read_to_string(out.join("paper-tables.md")).unwrap();
     assert!(page.contains("## lerf: ramen, teatime") && page.contains("### alignment"), "{page}");
     let steps = page.lines().find(|l| l.starts_with("| steps 1, 2, 3 |")).unwrap();
-    assert!(steps.contains(" ± ") && steps.contains("(0.538)") && steps.contains("| 2 |"), "{steps}");
+    assert!(steps.contains(" ± ") && !steps.contains("(0.538)") && steps.contains("| 2 |"), "{steps}");
     assert!(page.contains("mIoU by scene") && page.contains("lerf: figurines lacks"), "{page}");
     // The second call reuses every row.
     let seconds = || {

@@ -1,7 +1,8 @@
 //! `--compat`: choices of the paper, its authors' code and LangSplat that differ from this
 //! program's defaults (docs/internals/method.md#differences-from-the-paper). Each switch is a field
 //! here and a row of the table there.
-use super::method::Method;
+use super::method::Recipe;
+use crate::fit::FeatureStorage;
 use crate::language::Reducer;
 use crate::language::align::{AlignOptions, AreaScore};
 use crate::query::{MaskRule, QueryOptions};
@@ -135,10 +136,22 @@ impl Compat {
     }
 }
 
+impl Compat {
+    /// A recipe with the alignment, code length and storage of this set.
+    pub fn recipe(&'static self, recipe: Recipe) -> Recipe {
+        Recipe {
+            feature_dim: feature_dim(Some(self), &recipe),
+            align: self.align,
+            storage: FeatureStorage::Numbers,
+            ..recipe
+        }
+    }
+}
+
 /// Length of the codes. A baseline keeps that of its authors.
-pub fn feature_dim(compat: Option<&Compat>, method: &Method) -> usize {
-    let applicable = compat.filter(|_| method.recipe.reducer == Reducer::Bijection);
-    applicable.map_or(method.recipe.feature_dim, |c| c.feature_dim)
+pub fn feature_dim(compat: Option<&Compat>, recipe: &Recipe) -> usize {
+    let applicable = compat.filter(|_| recipe.reducer == Reducer::Bijection);
+    applicable.map_or(recipe.feature_dim, |c| c.feature_dim)
 }
 
 /// Query options of a set.

@@ -10,7 +10,7 @@ use super::sources::{
 };
 #[cfg(feature = "cli")]
 pub use super::whole::whole;
-use crate::fit::{FeatureStorage, Preset};
+use crate::fit::Preset;
 use crate::infer::installed::Inventory;
 use crate::language::Reducer;
 use crate::language::sam::SamOptions;
@@ -240,7 +240,7 @@ impl LanguageConfig {
 
     /// Length of the codes.
     pub fn feature_dim(&self, preset: Option<Preset>) -> usize {
-        self.feature_dim.unwrap_or_else(|| compat::feature_dim(self.compat, self.method(preset)))
+        self.feature_dim.unwrap_or_else(|| compat::feature_dim(self.compat, &self.method(preset).recipe))
     }
 
     /// Whether every level has a model of its own.
@@ -251,11 +251,8 @@ impl LanguageConfig {
     /// The choices of the method, with the code length and the alignment of this configuration.
     pub fn recipe(&self, preset: Option<Preset>) -> Recipe {
         let recipe = self.method(preset).recipe;
-        let (align, storage) = match self.compat {
-            Some(compat) => (compat.align, FeatureStorage::Numbers),
-            None => (recipe.align, recipe.storage),
-        };
-        Recipe { feature_dim: self.feature_dim(preset), align, storage, ..recipe }
+        let recipe = self.compat.map_or(recipe, |compat| compat.recipe(recipe));
+        Recipe { feature_dim: self.feature_dim(preset), ..recipe }
     }
 
     /// Prompts of a mask network.

@@ -19,7 +19,7 @@ mod tables;
 pub use data::{DataSet, Layout};
 pub use measure::Measurement;
 pub use runner::{Prepared, RowFigures, Runner, feature_bytes};
-pub use setup::{Available, Network, Regions, RowWork, Setup, Sources, TableRow};
+pub use setup::{Available, Network, Regime, Regions, RowWork, Setup, Sources, TableRow};
 pub use spread::{Difference, Spread};
 pub use stages::{EmbeddingAgreement, Scored};
 pub use table::{FinishedRow, FinishedTable, PaperSet};
@@ -28,7 +28,7 @@ pub use tables::{TABLES, Table, table};
 use crate::{Error, Result};
 use data::Scope;
 use setup::Group;
-use splatvk::fit::{LanguageOptions, Preset, RgbOptions};
+use splatvk::fit::RgbOptions;
 use splatvk::gpu::Device;
 use splatvk::infer::Registry;
 use splatvk::progress::Progress;
@@ -39,6 +39,8 @@ use splatvk::run::method::SPARSELGS;
 pub struct Plan {
     /// Tables in the order in which they run.
     pub tables: Vec<&'static Table>,
+    /// Schedules and rules of all rows.
+    pub regime: Regime,
     /// Sources of rows that do not vary them.
     pub sources: Sources,
     /// Masks and features of every table; `None`: those of [`Table`].
@@ -62,16 +64,15 @@ impl Default for Plan {
     fn default() -> Self {
         Plan {
             tables: TABLES.iter().collect(),
+            regime: Regime::OWN,
             sources: Sources::default(),
             regions: None,
             views: None,
             true_cameras: false,
             max_points: None,
             seeds: vec![0],
-            iterations: RgbOptions::preset(Preset::Draft).iterations,
-            // Three times draft's, whose features hardly leave their lifted start; methods differ
-            // in the result of training.
-            language_iterations: 3 * LanguageOptions::preset(Preset::Draft).iterations,
+            iterations: RgbOptions::preset(Regime::OWN.preset).iterations,
+            language_iterations: Regime::OWN.language_iterations(),
         }
     }
 }
@@ -159,16 +160,18 @@ impl Study<'_> {
 
     /// Setup of rows that vary nothing.
     fn base(&self, lab: &Runner, regions: Regions) -> Setup {
-        let Plan { sources, views, true_cameras, max_points, iterations, language_iterations, .. } =
-            self.plan;
+        let Plan {
+            regime, sources, views, true_cameras, max_points, iterations, language_iterations, ..
+        } = self.plan;
         Setup {
+            regime: *regime,
             views: views.unwrap_or_else(|| lab.default_views()),
             init: sources.init.clone(),
             true_cameras: *true_cameras,
             matcher: sources.matcher.clone(),
             max_points: *max_points,
             regions,
-            recipe: SPARSELGS.recipe,
+            recipe: regime.recipe(SPARSELGS.recipe),
             iterations: *iterations,
             language_iterations: *language_iterations,
         }

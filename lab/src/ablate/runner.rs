@@ -15,7 +15,6 @@ use splatvk::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage
 use splatvk::gpu::Device;
 use splatvk::infer::Registry;
 use splatvk::infer::installed::{Installed, Task, catalogue, inventory};
-use splatvk::language::sam::SamOptions;
 use splatvk::language::{Language, ViewMasks};
 use splatvk::photo;
 use splatvk::pipeline::{Context, Graph, Output, Stage, Store};
@@ -23,6 +22,7 @@ use splatvk::pose::Geometry;
 use splatvk::progress::{Progress, Recorded};
 use splatvk::query::{QueryOptions, TextQuery};
 use splatvk::run::ask;
+use splatvk::run::compat::query_options;
 use splatvk::run::method::LIFT;
 use splatvk::run::score::{Questions, ScoredScene, score_field};
 use splatvk::run::sources::{
@@ -196,6 +196,7 @@ impl<'a> Runner<'a> {
             // Half of the held-out frames must stay held out.
             views: count(Split::Train) + count(Split::Test) / 2,
             cameras: self.data.layout == Layout::Own || !self.data.known.is_empty(),
+            published: self.data.layout != Layout::Own,
             geometry: networks(&installed, Task::Geometry),
             matchers: networks(&installed, Task::Matcher),
             masks: networks(&installed, Task::Masks),
@@ -214,8 +215,8 @@ impl<'a> Runner<'a> {
     }
 
     /// Runs all stages of a setup that precede the training of splats.
-    pub fn prepared(&mut self, setup: &Setup, preset: Preset) -> Result<Prepared> {
-        let s = self.stages_of(setup, preset)?;
+    pub fn prepared(&mut self, setup: &Setup) -> Result<Prepared> {
+        let s = self.stages(setup)?;
         let targets = [s.placed.target(), s.geometry.target(), s.aligned.target()];
         let progress = Recorded::new(self.progress);
         let made = s.build.graph.run(&targets, self.device, self.registry, &self.store, &progress)?;
@@ -243,10 +244,7 @@ impl<'a> Runner<'a> {
 
     /// Builds the graph of a setup, up to its scores.
     fn stages(&mut self, setup: &Setup) -> Result<Stages> {
-        self.stages_of(setup, Preset::Draft)
-    }
-
-    fn stages_of(&mut self, setup: &Setup, preset: Preset) -> Result<Stages> {
+        let regime = setup.regime;
         let frames = self.frames(setup.views)?;
         let paths: Vec<PathBuf> = frames.iter().map(|f| self.truth.folder.join(&f.file)).collect();
         let photos = photo::load_all(&paths, self.progress)?;
@@ -256,10 +254,10 @@ impl<'a> Runner<'a> {
         let mut build = GraphBuilder {
             graph: Graph::default(),
             registry: registry.clone(),
-            sam: SamOptions::default(),
+            sam: regime.sam(),
             given_features,
             depth_prior: sources::default::<DepthSources>(),
-            preset,
+            preset: regime.preset,
             seed: self.seed,
         };
         let posed = if setup.true_cameras {
@@ -275,18 +273,13 @@ impl<'a> Runner<'a> {
         let RegionData { masks, embeddings, queries, space } = self.add_regions(setup, &mut build, posed)?;
         let (recipe, seed) = (setup.recipe, self.seed);
         let aligned = build.graph.add(stages::Align { recipe, space, seed }, (masks, matches, geometry));
-        let options = LanguageOptions {
-            iterations: setup.language_iterations,
-            seed,
-            // No early stop: all rows train for the same number of steps.
-            check_every: 0,
-            ..LanguageOptions::preset(Preset::Draft)
-        };
+        let options = regime.language(setup.language_iterations, seed);
         let language = build.graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
         let scene = (trained, language, embeddings);
         let scored = match self.data.layout {
             Layout::Own => {
-                build.graph.add(Score { truth: self.truth.clone(), queries: queries.clone() }, scene)
+                let options = query_options(regime.compat);
+                build.graph.add(Score { truth: self.truth.clone(), queries: queries.clone(), options }, scene)
             }
             Layout::Published(kind) => {
                 let score = ScorePublished { data: self.data.clone(), kind, queries: queries.clone() };
@@ -297,7 +290,7 @@ impl<'a> Runner<'a> {
     }
 
     fn rgb_options(&self, setup: &Setup) -> RgbOptions {
-        let mut options = RgbOptions::preset(Preset::Draft).with_iterations(setup.iterations);
+        let mut options = RgbOptions::preset(setup.regime.preset).with_iterations(setup.iterations);
         options.seed = self.seed;
         options.init.max_points = setup.max_points.unwrap_or(options.init.max_points);
         setup.recipe.rgb(options)
@@ -464,7 +457,7 @@ struct RegionData {
 
 #[cfg(test)]
 mod tests {
-    use super::super::setup::Sources;
+    use super::super::setup::{Regime, Sources};
     use super::*;
     use splatvk::progress::Silent;
     use splatvk::run::method::SPARSELGS;
@@ -478,6 +471,7 @@ mod tests {
         let row = |views: usize| {
             let Sources { init, matcher, .. } = Sources::default();
             let setup = Setup {
+                regime: Regime::OWN,
                 views,
                 init,
                 true_cameras: true,

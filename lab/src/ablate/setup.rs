@@ -1,5 +1,8 @@
 //! Setups of the rows of a table: photos, sources, method, steps of training.
 use serde::Serialize;
+use splatvk::fit::{LanguageOptions, Preset};
+use splatvk::language::sam::SamOptions;
+use splatvk::run::Compat;
 use splatvk::run::method::Recipe;
 use splatvk::run::sources::{
     self, FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind,
@@ -85,9 +88,56 @@ impl Regions {
     }
 }
 
+/// Schedules and rules of all rows.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Regime {
+    /// Preset of cameras, stereo and training.
+    pub preset: Preset,
+    /// Choices of another implementation, as of `--compat`.
+    pub compat: Option<&'static Compat>,
+    /// Whether this is the paper's method with the paper's networks, so that the paper's figures
+    /// measure the same.
+    pub published: bool,
+}
+
+impl Regime {
+    /// The draft preset with this program's own rules.
+    pub const OWN: Regime = Regime { preset: Preset::Draft, compat: None, published: false };
+
+    /// A recipe with the alignment, code length and storage of the regime.
+    pub fn recipe(&self, recipe: Recipe) -> Recipe {
+        match self.compat {
+            None => recipe,
+            Some(compat) => compat.recipe(recipe),
+        }
+    }
+
+    /// Steps of the language stage. Those of draft hardly leave their lifted start, and methods
+    /// differ in the result of training: three times as many.
+    pub fn language_iterations(&self) -> usize {
+        let steps = LanguageOptions::preset(self.preset).iterations;
+        if self.preset == Preset::Draft { 3 * steps } else { steps }
+    }
+
+    /// Options of the language stage; all rows train for the same number of steps.
+    pub fn language(&self, iterations: usize, seed: u64) -> LanguageOptions {
+        let preset = LanguageOptions::preset(self.preset);
+        let per_level = preset.per_level || self.compat.is_some_and(|compat| compat.per_level);
+        LanguageOptions { iterations, seed, check_every: 0, per_level, ..preset }
+    }
+
+    /// Prompts of a mask network.
+    pub fn sam(&self) -> SamOptions {
+        let paint_in_order = self.compat.is_some_and(|compat| compat.paint_in_order);
+        SamOptions { paint_in_order, ..SamOptions::default() }
+    }
+}
+
 /// Options of a row.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Setup {
+    /// Schedules and rules.
+    pub regime: Regime,
     /// Number of photos.
     pub views: usize,
     /// Source of cameras and points.
@@ -154,6 +204,9 @@ pub struct Available {
     pub views: usize,
     /// Whether true cameras are known.
     pub cameras: bool,
+    /// Whether the data set is a published one, on which the paper's tables take found masks and
+    /// features.
+    pub published: bool,
     /// Networks for geometry.
     pub geometry: Vec<Network>,
     /// Networks for dense matches.

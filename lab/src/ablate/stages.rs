@@ -174,6 +174,8 @@ pub(super) struct Score {
     pub(super) truth: Arc<GroundTruth>,
     /// Queries of the evaluation's phrases, in its order.
     pub(super) queries: Vec<TextQuery>,
+    /// Options of the answers.
+    pub(super) options: QueryOptions,
 }
 
 impl Stage for Score {
@@ -184,7 +186,7 @@ impl Stage for Score {
 
     fn settings(&self) -> String {
         // The queries are of the space of the language, which is an input.
-        format!("{:?}", self.truth.folder)
+        format!("{:?} {:?}", self.truth.folder, self.options)
     }
 
     fn run(
@@ -200,7 +202,7 @@ impl Stage for Score {
         let report = score_field(
             context.device,
             ScoredScene { splats: &language.splats, backdrop: &trained.backdrop, field: &language.field },
-            Questions { queries: &self.queries, options: QueryOptions::default() },
+            Questions { queries: &self.queries, options: self.options },
             evaluation,
             false,
             context.progress,

@@ -2,6 +2,7 @@
 use super::data::{DataSet, Layout};
 use super::measure::Measurement;
 use super::paper;
+use super::setup::Regime;
 use super::spread::{Difference, Spread};
 use super::tables::{Column, Table};
 use serde_json::{Map, Value, json};
@@ -51,29 +52,37 @@ pub struct FinishedTable {
 const FIRST: [Column; 2] = [(HEADLINE, 3), ("mAcc", 3)];
 const LAST: [Column; 4] = [("mIoU photos", 3), ("mIoU held out", 3), ("Tr.T", 0), ("T.T", 0)];
 
-/// Data sets that select the paper's figures of a table.
+/// Data sets that select the paper's figures of a table. There are some where the rows measure the
+/// same as the paper: its method with its networks on its data sets.
 #[derive(Clone, Debug)]
 pub struct PaperSet {
     layout: Layout,
     scenes: Vec<String>,
+    published: bool,
 }
 
 impl PaperSet {
     /// Selects the figures of data sets of one layout.
-    pub fn of<'s>(layout: Layout, sets: impl Iterator<Item = &'s DataSet>) -> PaperSet {
-        PaperSet { layout, scenes: sets.map(|s| s.name.clone()).collect() }
+    pub fn of<'s>(layout: Layout, sets: impl Iterator<Item = &'s DataSet>, regime: Regime) -> PaperSet {
+        PaperSet { layout, scenes: sets.map(|s| s.name.clone()).collect(), published: regime.published }
+    }
+
+    /// Whether the paper has figures of these rows.
+    fn applies(&self) -> bool {
+        self.published && self.layout != Layout::Own
     }
 
     /// Name of a scene in the paper's figures.
     fn scene(&self, name: &str) -> String {
-        // Scenes of layout `own` are not the paper's, even with the same name.
-        let set = if self.layout == Layout::Own { "own" } else { self.layout.paper() };
-        format!("{set}/{}", name.rsplit('/').next().unwrap_or(name))
+        format!("{}/{}", self.layout.paper(), name.rsplit('/').next().unwrap_or(name))
     }
 
     /// The paper's figures of a row: those of the scene if there is only one, else of the data set,
     /// else of the scene that the paper shows.
     fn figures(&self, table: &str, row: &str) -> Vec<(&'static str, f64)> {
+        if !self.applies() {
+            return Vec::new();
+        }
         let set = self.layout.paper();
         let mut names = vec![set.to_owned(), format!("{set}/teatime")];
         if let [scene] = &self.scenes[..] {
@@ -88,7 +97,7 @@ impl PaperSet {
             let all = paper::figures(table, row, &[self.scene(scene)]);
             Some((scene.clone(), all.iter().find(|f| f.0 == HEADLINE)?.1))
         };
-        self.scenes.iter().filter_map(miou).collect()
+        self.scenes.iter().filter(|_| self.applies()).filter_map(miou).collect()
     }
 }
 
@@ -322,7 +331,8 @@ mod tests {
     }
 
     fn finished(all: &[Measurement]) -> FinishedTable {
-        let own = PaperSet { layout: Layout::Own, scenes: vec!["a".into()] };
+        let lerf = Layout::Published(ProtocolKind::Lerf);
+        let own = PaperSet { layout: lerf, scenes: vec!["a".into()], published: true };
         FinishedTable::of(table("alignment").unwrap(), all, &own)
     }
 
@@ -360,16 +370,22 @@ mod tests {
     fn paper_set_selects_figures_of_scenes() {
         let paper = |layout, scenes: &[&str], table: &str, row: &str| {
             let scenes = scenes.iter().map(|s| (*s).to_owned()).collect();
-            let set = PaperSet { layout, scenes };
+            let set = PaperSet { layout, scenes, published: true };
             (set.figures(table, row).first().map(|f| f.1), set.by_scene(table, row).len())
         };
         let lerf = Layout::Published(ProtocolKind::Lerf);
         assert_eq!(paper(lerf, &["teatime"], "methods", "sparselgs"), (Some(0.713), 1));
         assert_eq!(paper(lerf, &["teatime", "ramen", "mine"], "methods", "sparselgs"), (Some(0.538), 2));
         assert_eq!(paper(lerf, &["teatime", "ramen"], "views", "2 views").0, Some(0.7341));
-        assert_eq!(paper(Layout::Own, &["teatime"], "methods", "sparselgs"), (Some(0.538), 0));
+        assert_eq!(paper(Layout::Own, &["teatime"], "methods", "sparselgs"), (None, 0));
+        let draft = PaperSet { layout: lerf, scenes: vec!["teatime".into()], published: false };
+        assert_eq!(
+            (draft.figures("methods", "sparselgs"), draft.by_scene("methods", "sparselgs").len()),
+            (vec![], 0)
+        );
         let scannet = Layout::Published(ProtocolKind::ScanNet);
-        assert_eq!(paper(scannet, &["a"], "feed-forward", "lsm").0, Some(0.4709));
+        assert_eq!(paper(scannet, &["a"], "feed-forward", "true segmentation").0, Some(0.5977));
+        assert_eq!(paper(scannet, &["a"], "feed-forward", "lsm").0, None);
         let ovs = Layout::Published(ProtocolKind::Ovs);
         assert_eq!(paper(ovs, &["x/room"], "methods", "langsplat").0, Some(0.004));
     }

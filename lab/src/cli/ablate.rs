@@ -1,21 +1,24 @@
 //! `splatlab ablate`
 use super::args::{AblateArgs, LayoutArg};
 use crate::ablate::{
-    self, DataSet, Finished, FinishedTable, Layout, Measurement, PaperSet, Plan, Regions, Sources, TABLES,
-    Table,
+    self, DataSet, Finished, FinishedTable, Layout, Measurement, PaperSet, Plan, Regime, Regions, Sources,
+    TABLES, Table,
 };
 use crate::{Error, Result};
 use serde_json::{Value, json};
 use splatvk::cli::outputs::WrittenFile;
 use splatvk::cli::print::{print, print_json};
 use splatvk::cli::progress;
+use splatvk::fit::RgbOptions;
 use splatvk::format::write_json;
 use splatvk::gpu;
 use splatvk::infer::Registry;
 use splatvk::infer::installed::{Inventory, inventory};
+use splatvk::run::paper::PaperSources;
 use splatvk::run::sources::{
     FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice, SourceKind, choose,
 };
+use splatvk::run::{Compat, GeometryConfig, LanguageConfig, ReconstructionConfig, TrainingConfig};
 use splatvk_types::files;
 use splatvk_types::files::{Kind, Partial, check_place};
 use std::path::{Path, PathBuf};
@@ -26,7 +29,7 @@ pub fn ablate(args: &AblateArgs) -> Result<()> {
     let plan = plan(args, &registry)?;
     let sets = data_sets(&args.data, args.layout)?;
     let layout = one_layout(&sets)?;
-    let paper = PaperSet::of(layout, sets.iter());
+    let paper = PaperSet::of(layout, sets.iter(), plan.regime);
     let out = args.out.clone().unwrap_or_else(|| default_out(&sets));
     // With --resume, a folder that holds a report is not in the way.
     check_place(&out, Kind::Folder, args.force || (args.resume && out.join(REPORT).is_file()))?;
@@ -171,7 +174,6 @@ fn default_out(sets: &[DataSet]) -> PathBuf {
 }
 
 fn plan(args: &AblateArgs, registry: &Registry) -> Result<Plan> {
-    let default = Plan::default();
     for (flag, value) in
         [("--iterations", args.iterations), ("--language-iterations", args.language_iterations)]
     {
@@ -184,8 +186,9 @@ fn plan(args: &AblateArgs, registry: &Registry) -> Result<Plan> {
     if seeds.windows(2).any(|w| w[0] == w[1]) {
         return Err(Error::input("--seeds: the same seed twice; give each once"));
     }
-    let sources = sources(args, registry)?;
+    let (regime, sources) = regime(args, sources(args, registry)?, registry)?;
     Ok(Plan {
+        regime,
         tables: TABLES
             .iter()
             .filter(|t| args.tables.iter().any(|name| name == "all" || t.name == name))
@@ -196,9 +199,42 @@ fn plan(args: &AblateArgs, registry: &Registry) -> Result<Plan> {
         true_cameras: args.true_cameras,
         max_points: args.max_points,
         seeds: args.seeds.clone(),
-        iterations: args.iterations.unwrap_or(default.iterations),
-        language_iterations: args.language_iterations.unwrap_or(default.language_iterations),
+        iterations: args.iterations.unwrap_or_else(|| RgbOptions::preset(regime.preset).iterations),
+        language_iterations: args.language_iterations.unwrap_or_else(|| regime.language_iterations()),
     })
+}
+
+/// Schedules and rules of every row, and with --paper the paper's networks.
+fn regime(args: &AblateArgs, sources: Sources, registry: &Registry) -> Result<(Regime, Sources)> {
+    if !args.paper {
+        let compat = args.compat.as_deref().map_or(Ok(None), Compat::named)?;
+        return Ok((Regime { preset: args.preset, compat, published: false }, sources));
+    }
+    let named = |source: &Option<String>, own: SourceChoice| match source {
+        Some(_) => own,
+        None => SourceChoice::named("auto"),
+    };
+    let config = ReconstructionConfig {
+        geometry: GeometryConfig { init: named(&args.init, sources.init), ..GeometryConfig::default() },
+        training: TrainingConfig::default(),
+        language: Some(LanguageConfig {
+            paper: true,
+            paper_sources: args.paper_sources,
+            matcher: named(&args.matcher, sources.matcher),
+            masks: named(&args.masks, sources.masks),
+            features: named(&args.features, sources.features),
+            ..LanguageConfig::default()
+        }),
+    };
+    let config = config.resolved(&inventory(registry))?;
+    let language = config.language.unwrap_or_default();
+    let regime = Regime {
+        preset: config.training.preset.unwrap_or(Regime::OWN.preset),
+        compat: language.compat,
+        published: args.paper_sources == PaperSources::Own,
+    };
+    let LanguageConfig { matcher, masks, features, .. } = language;
+    Ok((regime, Sources { init: config.geometry.init, matcher, masks, features }))
 }
 
 /// Sources of every row. Options that are not given default to the built-in sources, so that tables

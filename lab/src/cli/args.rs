@@ -7,6 +7,8 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use splatvk::cli::args::{DeviceArgs, GlobalArgs, whole};
 use splatvk::fit::Preset;
+use splatvk::run::config::compat_names as compats;
+use splatvk::run::paper::PaperSources;
 use std::path::PathBuf;
 
 /// Tables of the paper's experiments, and data with ground truth
@@ -97,9 +99,12 @@ fn flats() -> impl TypedValueParser<Value = Flat> {
     one_of(&Flat::ALL)
 }
 
-/// Presets whose trainings curves compare.
-static PRESETS: [(Preset, &str, &str); 2] =
-    [(Preset::Draft, "draft", "Fewer splats"), (Preset::Default, "default", "The preset of run on a GPU")];
+/// Presets of cameras, stereo and training.
+static PRESETS: [(Preset, &str, &str); 3] = [
+    (Preset::Draft, "draft", "Fewer splats"),
+    (Preset::Default, "default", "The preset of run on a GPU"),
+    (Preset::Paper, "paper", "The paper's schedule"),
+];
 
 /// Parser of one of a list of (value, name, help text).
 fn one_of<T: Copy + Send + Sync + 'static>(
@@ -193,10 +198,30 @@ pub struct AblateArgs {
     /// The same for features [default: words]
     #[arg(long, value_name = "SOURCE")]
     pub features: Option<String>,
-    /// Optimisation steps of the colour stage, instead of draft's
+    /// Preset of cameras, stereo and training
+    #[arg(long, value_parser = one_of(&PRESETS), default_value = "draft", value_name = "PRESET")]
+    pub preset: Preset,
+    /// Choices of every row, as of run: paper, authors or langsplat
+    #[arg(long, value_parser = compats(), value_name = "WHOSE")]
+    pub compat: Option<String>,
+    /// The paper's method in every row, as of run: its schedules, rules and networks. The paper's
+    /// figures stand beside those on its data sets
+    #[arg(long, conflicts_with_all = ["preset", "compat"])]
+    pub paper: bool,
+    /// Networks with --paper; with any, the paper's figures are left out
+    #[arg(
+        long,
+        value_enum,
+        default_value_t,
+        hide_default_value = true,
+        requires = "paper",
+        value_name = "WHICH"
+    )]
+    pub paper_sources: PaperSources,
+    /// Optimisation steps of the colour stage, instead of the preset's
     #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
     pub iterations: Option<usize>,
-    /// Optimisation steps of the language stage [default: 30]
+    /// Optimisation steps of the language stage [default: the preset's; draft: 30]
     #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
     pub language_iterations: Option<usize>,
     /// Device and models

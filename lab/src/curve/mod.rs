@@ -9,7 +9,7 @@ mod variant;
 pub use points::{Curve, Point, mean};
 pub use variant::Variant;
 
-use crate::ablate::{DataSet, Prepared, Regions, Runner, Setup, Sources};
+use crate::ablate::{DataSet, Prepared, Regime, Regions, Runner, Setup, Sources};
 use crate::{Error, Result};
 use splatvk::fit::{Preset, RgbOptions};
 use splatvk::gpu::Device;
@@ -54,6 +54,7 @@ pub fn measure(
     runner.start_seed(plan.seed);
     let Sources { init, matcher, .. } = Sources::default();
     let setup = Setup {
+        regime: Regime { preset: plan.preset, ..Regime::OWN },
         views: plan.views.unwrap_or_else(|| runner.default_views()),
         init,
         true_cameras: plan.true_cameras,
@@ -68,7 +69,7 @@ pub fn measure(
     let prepared = match file.as_deref().filter(|f| f.exists()) {
         Some(file) => read(file)?,
         None => {
-            let prepared = runner.prepared(&setup, plan.preset)?;
+            let prepared = runner.prepared(&setup)?;
             file.iter().try_for_each(|file| write(file, &prepared))?;
             prepared
         }
