@@ -20,7 +20,7 @@ pub use data::{DataSet, Layout};
 pub use measure::Measurement;
 pub use runner::{Prepared, RowFigures, Runner, feature_bytes};
 pub use setup::{Available, Network, Regime, Regions, RowWork, Setup, Sources, TableRow};
-pub use spread::{Difference, Spread};
+pub use spread::{Difference, MARGIN, Spread, Verdict};
 pub use stages::{EmbeddingAgreement, Scored};
 pub use table::{FinishedRow, FinishedTable, PaperSet};
 pub use tables::{TABLES, Table, table};

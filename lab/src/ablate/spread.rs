@@ -33,6 +33,25 @@ pub struct Difference {
     pub half: Option<f64>,
     /// Number of scenes.
     pub scenes: usize,
+    /// Sample standard deviation over scenes; `None` for a single scene.
+    pub sd: Option<f64>,
+}
+
+/// Difference of mIoU that matters: one point.
+pub const MARGIN: f64 = 0.01;
+
+/// Decision of a comparison over scenes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// The interval is above zero, and not within [`MARGIN`].
+    Better,
+    /// The interval is below zero, and not within [`MARGIN`].
+    Worse,
+    /// The interval is within ± [`MARGIN`] (two one-sided tests, Schuirmann 1987).
+    Equal,
+    /// None of these; about so many scenes give an interval of ± [`MARGIN`].
+    Open(usize),
 }
 
 impl Difference {
@@ -43,12 +62,22 @@ impl Difference {
         values.iter().for_each(|(scene, v)| scenes.entry(scene).or_default().push(*v));
         let means: Vec<f64> = scenes.values().filter_map(|v| Spread::of(v)).map(|s| s.mean).collect();
         let Spread { mean, sd, n } = Spread::of(&means)?;
-        Some(Difference { mean, half: sd.map(|sd| student(n - 1) * sd / (n as f64).sqrt()), scenes: n })
+        Some(Difference { mean, half: sd.map(|sd| student(n - 1) * sd / (n as f64).sqrt()), scenes: n, sd })
     }
 
-    /// Whether the 95 % confidence interval excludes zero.
-    pub fn is_decided(&self) -> bool {
-        self.half.is_some_and(|half| self.mean.abs() > half)
+    /// The decision by the 95 % confidence interval; `None` for a single scene.
+    pub fn verdict(&self) -> Option<Verdict> {
+        let (half, sd) = (self.half?, self.sd?);
+        Some(if self.mean.abs() + half <= MARGIN {
+            Verdict::Equal
+        } else if self.mean > half {
+            Verdict::Better
+        } else if self.mean < -half {
+            Verdict::Worse
+        } else {
+            // With many scenes Student's t is the normal distribution.
+            Verdict::Open((1.96 * sd / MARGIN).powi(2).ceil().max(2.0) as usize)
+        })
     }
 }
 
@@ -86,9 +115,21 @@ mod tests {
         let again = Difference::of(&thrice).unwrap();
         assert!((once.half.unwrap() - again.half.unwrap()).abs() < 1e-12 && again.scenes == 3);
         // 0.2 ± 4.303 · 0.1 / √3 does not exclude zero.
-        assert!((once.half.unwrap() - 0.2484).abs() < 1e-3 && !once.is_decided());
-        assert!(Difference::of(&[("a", 0.2), ("b", 0.2), ("c", 0.21)]).unwrap().is_decided());
-        assert!(!Difference::of(&[("a", 0.9), ("a", 0.9)]).unwrap().is_decided(), "one scene");
+        assert!((once.half.unwrap() - 0.2484).abs() < 1e-3);
+    }
+
+    #[test]
+    fn verdict_needs_interval_off_zero_or_within_margin() {
+        let verdict = |values: [f64; 3]| {
+            let scenes = ["a", "b", "c"].into_iter().zip(values).collect::<Vec<_>>();
+            Difference::of(&scenes).unwrap().verdict().unwrap()
+        };
+        assert_eq!(verdict([0.2, 0.2, 0.21]), Verdict::Better);
+        assert_eq!(verdict([-0.2, -0.2, -0.21]), Verdict::Worse);
+        assert_eq!(verdict([0.003, 0.003, 0.004]), Verdict::Equal, "off zero, but within a point");
+        // sd 0.1: (1.96 · 0.1 / 0.01)² scenes.
+        assert_eq!(verdict([0.1, 0.2, 0.3]), Verdict::Open(385));
+        assert_eq!(Difference::of(&[("a", 0.9), ("a", 0.9)]).unwrap().verdict(), None, "one scene");
     }
 
     #[test]

@@ -3,7 +3,7 @@ use super::data::{DataSet, Layout};
 use super::measure::Measurement;
 use super::paper;
 use super::setup::Regime;
-use super::spread::{Difference, Spread};
+use super::spread::{Difference, Spread, Verdict};
 use super::tables::{Column, Table};
 use serde_json::{Map, Value, json};
 use splatvk::report::chart::{Bar, bar_chart};
@@ -164,16 +164,23 @@ impl FinishedRow {
         json!({
             "group": self.group, "label": self.label, "note": self.note, "setup": self.setup,
             "figures": map(means.collect()), "spread": self.figures, "difference": self.difference,
-            "decided": self.difference.map(|d| d.is_decided()), "paper": map(paper.collect()),
+            "verdict": self.difference.and_then(|d| d.verdict()), "paper": map(paper.collect()),
             "scenes": self.by_scene, "paper_scenes": self.paper_by_scene, "iou": self.iou,
         })
     }
 
-    /// Text of the difference with its interval, and "open" where the interval holds zero.
+    /// Text of the difference with its interval and verdict.
     fn compared(&self) -> String {
         match &self.difference {
             Some(d @ Difference { mean, half: Some(half), .. }) => {
-                format!("{mean:+.3} ± {half:.3}{}", if d.is_decided() { "" } else { " open" })
+                let verdict = match d.verdict() {
+                    Some(Verdict::Better) => "better".to_owned(),
+                    Some(Verdict::Worse) => "worse".to_owned(),
+                    Some(Verdict::Equal) => "equal".to_owned(),
+                    Some(Verdict::Open(scenes)) => format!("open: {scenes} scenes"),
+                    None => String::new(),
+                };
+                format!("{mean:+.3} ± {half:.3} {verdict}")
             }
             Some(Difference { mean, .. }) => format!("{mean:+.3}"),
             None => String::new(),
@@ -260,7 +267,8 @@ impl FinishedTable {
         let mut text = aligned(&cells);
         if self.several {
             text += "± standard deviation over scenes and seeds (n runs); Δ: mean difference to the row without one, same \
-                     scenes and seeds, ± half of its 95 % interval over scenes; open: the interval holds zero\n";
+                     scenes and seeds, ± half of its 95 % interval over scenes; equal: within a point; open: about so many scenes \
+                     would decide within a point\n";
         }
         text
     }
@@ -352,7 +360,7 @@ mod tests {
         assert!((none.figures["mIoU"].mean - 0.605).abs() < 1e-9 && none.figures["mIoU"].n == 6);
         // Scenes differ by 0.2, the rows by 0.1 in every scene.
         let d = none.difference.unwrap();
-        assert!((d.mean + 0.1).abs() < 1e-9 && d.is_decided() && d.scenes == 3, "{d:?}");
+        assert!((d.mean + 0.1).abs() < 1e-9 && d.verdict() == Some(Verdict::Worse) && d.scenes == 3, "{d:?}");
         assert!(none.figures["mIoU"].sd.unwrap() > 0.15 && reference.difference.is_none());
         assert_eq!(none.note, "1 of 7 failed, first d with seed 0: no cameras");
         let text = done.text();
@@ -360,8 +368,8 @@ mod tests {
         let json = done.json();
         assert_eq!(json["rows"][0]["spread"]["mIoU"]["n"], 6);
         assert_eq!(
-            (json["rows"][0]["decided"].as_bool(), json["rows"][0]["scenes"]["a"]["n"].as_u64()),
-            (Some(true), Some(2))
+            (json["rows"][0]["verdict"].as_str(), json["rows"][0]["scenes"]["a"]["n"].as_u64()),
+            (Some("worse"), Some(2))
         );
         assert!(done.svg().contains("none"));
     }
