@@ -4,6 +4,7 @@ use super::outcome::RunOutcome;
 use super::record::{curves, run_record};
 use crate::Result;
 use crate::fit::ViewDependence;
+use crate::infer::words;
 use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
 use crate::query::presence::Presence;
@@ -120,6 +121,12 @@ fn figures(o: &RunOutcome) -> Vec<Figure> {
         let meaning =
             "What the scene is divided into. A click selects one; a thing may still be several that touch.";
         list.push(Figure::that_matters("things", text, meaning));
+        if language.field.space == words::SPACE {
+            let text = "the built-in ones; `splatvk models fetch open` installs better ones".to_owned();
+            let meaning = "A stand-in for a language network: English names of about a thousand everyday things, and colours. \
+                           An answer about anything else is a guess.";
+            list.push(Figure::that_matters("words", text, meaning));
+        }
     }
     list.extend(sky_figure(&o.photos, &o.geometry.sky));
     list.push(up_figure(&o.world));

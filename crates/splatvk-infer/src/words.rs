@@ -32,6 +32,8 @@ const MEANING_AT: usize = 0;
 const CLASSES_AT: usize = text::DIM;
 const COLOUR_AT: usize = CLASSES_AT + CLASSES;
 const REST_AT: usize = COLOUR_AT + colour::COUNT;
+/// Name of the embedding space.
+pub const SPACE: &str = "words-1";
 /// Length of an embedding.
 pub const DIM: usize = REST_AT + 1;
 
@@ -91,7 +93,7 @@ impl RegionWords {
 
 impl RegionEncoder for RegionWords {
     fn space(&self) -> &str {
-        "words-1"
+        SPACE
     }
 
     fn dim(&self) -> usize {
