@@ -16,10 +16,6 @@ const MIN_CERTAINTY: f32 = 0.35;
 /// (docs/internals/method.md#reprojection).
 const DEPTH_TOLERANCE: f64 = 0.05;
 
-/// Least confidence of a depth that links pixels, that of the depth loss. Filled holes have less: a
-/// hole across two things would link one with the other.
-const MIN_CONFIDENCE: f32 = 0.5;
-
 /// Largest ratio of the four neighbouring depths that are interpolated as one surface
 /// (docs/internals/method.md#reprojection).
 const SAME_SURFACE: f32 = 1.06;
@@ -148,7 +144,7 @@ fn reproject(from: &Camera, depth: &DepthMap, to: &Camera, other: &DepthMap) -> 
         .into_par_iter()
         .map(|p| {
             let z = depth.depth.data[p] as f64;
-            if z <= 0.0 || depth.confidence.data[p] < MIN_CONFIDENCE {
+            if z <= 0.0 || depth.confidence.data[p] <= 0.0 {
                 return (NONE, false);
             }
             let home = DVec2::new((p % width) as f64 + 0.5, (p / width) as f64 + 0.5);
