@@ -75,6 +75,17 @@ impl Scene {
         reference::forward(&self.params(), &self.view, MODE, &Cutoffs::STANDARD)
     }
 
+    /// The scene on the screen, without features.
+    fn projected<'a>(&'a self, forward: &'a Forward) -> ReferenceScene<'a> {
+        ReferenceScene {
+            projected: &forward.projected,
+            features: &[],
+            feature_dim: 0,
+            order: &forward.order,
+            view: &self.view,
+        }
+    }
+
     fn rendered(&self, device: &Device, choices: DeviceChoices) -> crate::Result<(SplatBuffers, Rasterizer)> {
         let params = SplatBuffers::upload(device, &self.splats, &self.features, self.dim)?;
         let mut raster = Rasterizer::with(device, self.splats.len(), self.dim, SIZE[0], SIZE[1], choices)?;
@@ -106,13 +117,7 @@ fn label_weights(device: &Device) -> Found {
     let mut sums = LabelWeights::new(scene.splats.len());
     raster.add_label_weights(&params, &scene.options, &labels, &mut sums)?;
     let forward = scene.reference();
-    let reference = ReferenceScene {
-        projected: &forward.projected,
-        features: &[],
-        feature_dim: 0,
-        order: &forward.order,
-        view: &scene.view,
-    };
+    let reference = scene.projected(&forward);
     let difference = sums.difference(&label_weights::reference(&reference, &labels));
     let text = format!("{difference:.1e} of the weights differ");
     Ok(if difference < 1e-3 { Ok(text) } else { Err(text) })
@@ -336,13 +341,7 @@ fn screen_gradients(device: &Device) -> Found {
     screen_gradients::record(&mut rec, frame, params.count, &sums);
     rec.run()?;
     let forward = scene.reference();
-    let reference = ReferenceScene {
-        projected: &forward.projected,
-        features: &[],
-        feature_dim: 0,
-        order: &forward.order,
-        view: &scene.view,
-    };
+    let reference = scene.projected(&forward);
     let upstream: Vec<f64> = upstream.iter().map(|&g| g.into()).collect();
     let gradients = raster_backward::reference(&reference, &Cutoffs::STANDARD, &upstream);
     let expected: Vec<f64> = forward

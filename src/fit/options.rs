@@ -96,7 +96,7 @@ pub struct RgbOptions {
     pub prune_every: usize,
     /// First step of pruning.
     pub prune_from: usize,
-    /// Density control; `None` = off. Not for options with a margin.
+    /// Density control; `None` = off. Not for options with a margin or bounds, which move rows.
     pub densify: Option<DensifyOptions>,
     /// Camera refinement; `None` = off.
     pub poses: Option<PoseOptions>,
