@@ -1,5 +1,5 @@
-//! Where a scene shows the thing that a text names: `cargo run --release --example query -- out/kitchen "blue
-//! mug" masks`.
+//! Where a scene shows the thing that a text names:
+//! `cargo run --release --example query -- out/kitchen "blue mug" masks`.
 use splatvk::format::picture;
 use splatvk::gpu;
 use splatvk::infer::Registry;

@@ -56,6 +56,8 @@ pub struct Answers {
     pub instances: Vec<Instance>,
     /// Highlighting in the scene as a whole.
     pub highlight: Highlight,
+    /// Whether every text has a mask ([`QueryOptions::published`]).
+    pub published: bool,
 }
 
 impl Answers {
@@ -79,6 +81,10 @@ impl Answers {
 
     /// The answer in a few words.
     pub fn verdict(&self) -> String {
+        if self.published {
+            let (masks, views) = (self.found(), self.views.len());
+            return format!("a mask in {masks} of {views} photos; presence is not judged");
+        }
         verdict(self.presence, &self.reading, self.found(), self.views.len())
     }
 
@@ -257,6 +263,7 @@ impl Prepared {
             selection,
             instances,
             highlight,
+            published: options.published,
         })
     }
 }
@@ -384,6 +391,7 @@ mod tests {
             let options = crate::run::compat::query_options(Some(compat));
             let a = wall.ask_with("lemon", Reading::default(), &options);
             assert_eq!((a.presence, a.p_value, a.found()), (None, None, 1), "{}", compat.name);
+            assert_eq!(a.verdict(), "a mask in 1 of 1 photos; presence is not judged");
             assert!(a.views[0].mask().data.contains(&true) && !a.selection.splats.is_empty());
         }
     }

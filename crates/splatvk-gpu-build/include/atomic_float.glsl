@@ -1,5 +1,6 @@
-// The one place that depends on float atomics. A shader that includes this file is compiled twice, with
-// FLOAT_ATOMICS=1 (VK_EXT_shader_atomic_float) and FLOAT_ATOMICS=0 (compare-and-swap loop), and the device picks.
+// The one place that depends on float atomics. A shader that includes this file is compiled twice,
+// with FLOAT_ATOMICS=1 (VK_EXT_shader_atomic_float) and FLOAT_ATOMICS=0 (compare-and-swap loop), and
+// the device picks.
 //
 //   buffer Grad { ATOMIC_FLOAT grad[]; };      // 32-bit floats in memory either way
 //   ATOMIC_ADD(grad[i], value);                // statement; the memory operand is evaluated more than once
