@@ -34,6 +34,8 @@ pub enum Command {
     Generate(GenerateArgs),
     /// Scene against the labels of LERF-OVS, 3D-OVS or ScanNet → figures of their protocols
     Eval(EvalArgs),
+    /// Scene against polygons on its photos → how useful its answers are to a user
+    Ask(AskArgs),
 }
 
 /// Published protocols.
@@ -80,6 +82,19 @@ pub struct EvalArgs {
     /// Write over what is there: ordinary files of the same names
     #[arg(long)]
     pub force: bool,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatlab ask`
+#[derive(Debug, Args)]
+pub struct AskArgs {
+    /// Scene directory
+    pub scene: PathBuf,
+    /// Folder of label files as in LERF-OVS, one per photo, and texts.json
+    #[arg(long, value_name = "DIR")]
+    pub labels: PathBuf,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

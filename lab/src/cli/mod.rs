@@ -2,6 +2,7 @@
 //! of `splatvk`.
 mod ablate;
 pub mod args;
+mod ask;
 mod curve;
 mod eval;
 mod generate;
@@ -40,6 +41,10 @@ impl Program for Lab {
             Command::Eval(mut args) => {
                 args.device.provider = self.global.provider;
                 eval::eval(&args)
+            }
+            Command::Ask(mut args) => {
+                args.device.provider = self.global.provider;
+                ask::ask(&args)
             }
         }
     }

@@ -19,6 +19,9 @@ use std::sync::Arc;
 /// Thresholds on the re-normalised map, the first one behind `miou`: the paper's, LangSplat's.
 const THRESHOLDS: [(f32, &str, &str); 2] = [(0.6, "thr0.6", "miou"), (0.4, "thr0.4", "miou_thr0.4")];
 
+/// Texts beside label files ([`super::Texts`]).
+pub(super) const TEXTS: &str = "texts.json";
+
 /// Truth of one prompt in one frame.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Target {
@@ -111,11 +114,11 @@ impl Lerf {
     }
 }
 
-fn read_folder(folder: &Path) -> Result<BTreeMap<String, BTreeMap<String, Target>>> {
+pub(super) fn read_folder(folder: &Path) -> Result<BTreeMap<String, BTreeMap<String, Target>>> {
     let mut labels = BTreeMap::new();
     for entry in std::fs::read_dir(folder).map_err(Error::io(folder))? {
         let path = entry.map_err(Error::io(folder))?.path();
-        if path.extension().is_some_and(|e| e == "json") {
+        if path.extension().is_some_and(|e| e == "json") && !path.ends_with(TEXTS) {
             let text = files::read_text(&path)?;
             let stem = path.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
             labels.insert(stem, parse(&text, &path)?);

@@ -5,6 +5,7 @@
 //! caller renders and decodes each frame and passes it to [`Protocol::add`]; [`Protocol::finish`]
 //! returns the scores with their definitions. The project's own protocol, `field`, is
 //! [`splatvk::eval`].
+mod answers;
 mod labels;
 mod lerf;
 mod ovs;
@@ -15,6 +16,7 @@ mod score;
 #[cfg(test)]
 mod tests;
 
+pub use answers::{Asked, Counts, Kind, Photographs, Texts};
 pub use labels::Labels;
 pub use score::{
     CodeScores, DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary,

@@ -1,0 +1,186 @@
+//! Answers as a user gets them, against polygons on photographs: presence, place and mask
+//! (docs/internals/method.md#photographs).
+use super::lerf::{self, Target};
+use super::score::mask_iou;
+use crate::{Error, Result};
+use serde::{Deserialize, Serialize};
+use splatvk::photo::stem;
+use splatvk::query::QueryOptions;
+use splatvk::query::presence::Presence;
+use splatvk::run::answer::Answers;
+use splatvk::run::ask::QueryScene;
+use splatvk::scene::Camera;
+use splatvk_types::files;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Texts of a set of photographs, from `texts.json`.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Texts {
+    /// Labelled things.
+    pub categories: Vec<String>,
+    /// Other usual names of a category.
+    #[serde(default)]
+    pub synonyms: BTreeMap<String, Vec<String>>,
+    /// Things that no photo shows.
+    #[serde(default)]
+    pub absent: Vec<String>,
+}
+
+/// Labels of a set of photographs.
+pub struct Photographs {
+    /// The texts to ask.
+    pub texts: Texts,
+    /// Labelled photos of the scene: camera, and truth by category.
+    frames: Vec<(Camera, BTreeMap<String, Target>)>,
+}
+
+/// Kind of a question.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Kind {
+    /// A labelled category.
+    Category,
+    /// Another name of a category.
+    Synonym,
+    /// Nothing that a photo shows.
+    Absent,
+}
+
+/// One question with its answer.
+#[derive(Clone, Debug, Serialize)]
+pub struct Asked {
+    /// The text.
+    pub text: String,
+    /// Its kind.
+    pub kind: Kind,
+    /// The answer in a few words.
+    pub verdict: String,
+    /// Whether the text is outside of the model's vocabulary.
+    pub unknown: bool,
+    /// Presence, and the share of other things that fit as well.
+    pub presence: Option<Presence>,
+    /// See `presence`.
+    pub p_value: Option<f32>,
+    /// Labelled photos that show the thing.
+    pub photos: usize,
+    /// Those in which the location of the answer lies on it.
+    pub located: usize,
+    /// Mean IoU of the answers' masks over these photos, empty ones included.
+    pub iou: Option<f64>,
+}
+
+impl Asked {
+    /// Whether most photos have the location right.
+    pub fn is_placed(&self) -> bool {
+        2 * self.located > self.photos
+    }
+}
+
+impl Photographs {
+    /// Reads `texts.json` and the label files of a folder; photos that are not in the scene are
+    /// left out.
+    pub fn open(folder: &Path, scene: &[Camera]) -> Result<Photographs> {
+        let file = folder.join(lerf::TEXTS);
+        let texts: Texts = files::parse_json(files::read_text(&file)?.as_bytes())
+            .map_err(|e| Error::input(format!("{}: {e}", file.display())))?;
+        let mut labels = lerf::read_folder(folder)?;
+        let own = scene.iter().filter_map(|c| Some((c.clone(), labels.remove(stem(&c.name))?)));
+        let frames: Vec<_> = own.collect();
+        if frames.is_empty() {
+            return Err(Error::input(format!("{}: no labelled photo is in the scene", folder.display())));
+        }
+        Ok(Photographs { texts, frames })
+    }
+
+    /// Asks all texts in the labelled photos.
+    pub fn ask(&self, scene: &mut QueryScene, options: &QueryOptions) -> Result<Vec<Asked>> {
+        let cameras: Vec<Camera> = self.frames.iter().map(|f| f.0.clone()).collect();
+        scene.set_views(&cameras)?;
+        let texts = &self.texts;
+        let own = texts.categories.iter().map(|c| (c, Kind::Category, Some(c)));
+        let others = texts.synonyms.iter();
+        let others = others.flat_map(|(c, list)| list.iter().map(move |t| (t, Kind::Synonym, Some(c))));
+        let absent = texts.absent.iter().map(|t| (t, Kind::Absent, None));
+        let mut asked = Vec::new();
+        for (text, kind, category) in own.chain(others).chain(absent) {
+            asked.push(self.judge(&scene.ask(text, options)?, kind, category)?);
+        }
+        Ok(asked)
+    }
+
+    fn judge(&self, answers: &Answers, kind: Kind, category: Option<&String>) -> Result<Asked> {
+        let (mut photos, mut located, mut overlap) = (0, 0, 0.0);
+        for ((_, targets), answer) in self.frames.iter().zip(&answers.views) {
+            let Some(target) = category.and_then(|c| targets.get(c)) else { continue };
+            let mask = answer.mask();
+            let truth = &target.mask;
+            let scaled = |p: usize, from: usize, to: usize| (2 * p + 1) * to / (2 * from.max(1));
+            let x = scaled(answer.location.0, mask.width, truth.width);
+            let y = scaled(answer.location.1, mask.height, truth.height);
+            photos += 1;
+            located += usize::from(x < truth.width && y < truth.height && truth.at(x, y));
+            overlap += mask_iou(&mask, truth)?;
+        }
+        Ok(Asked {
+            text: answers.text.clone(),
+            kind,
+            verdict: answers.sentence(),
+            unknown: answers.reading.is_unknown(),
+            presence: answers.presence,
+            p_value: answers.p_value,
+            photos,
+            located,
+            iou: (photos > 0).then(|| overlap / photos as f64),
+        })
+    }
+}
+
+/// Counts of the answers of one kind.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Counts {
+    /// All texts.
+    pub texts: usize,
+    /// Found, in the right place.
+    pub found: usize,
+    /// Found, in a wrong place, or on another thing.
+    pub misled: usize,
+    /// Unsure, in the right place.
+    pub unsure_placed: usize,
+    /// Unsure, in a wrong place.
+    pub unsure_elsewhere: usize,
+    /// No sign of it.
+    pub no_sign: usize,
+    /// Outside the vocabulary.
+    pub unknown: usize,
+    /// Photos, those with the right location, and the sum of IoU over them.
+    pub photos: usize,
+    /// See `photos`.
+    pub located: usize,
+    /// See `photos`.
+    pub iou: f64,
+}
+
+impl Counts {
+    /// Counts the answers of one kind.
+    pub fn of(asked: &[Asked], kind: Kind) -> Counts {
+        let mut counts = Counts::default();
+        for a in asked.iter().filter(|a| a.kind == kind && (kind == Kind::Absent || a.photos > 0)) {
+            counts.texts += 1;
+            let cell = match a.presence {
+                _ if a.unknown => &mut counts.unknown,
+                Some(Presence::Absent) => &mut counts.no_sign,
+                Some(Presence::Unsure) if a.is_placed() => &mut counts.unsure_placed,
+                Some(Presence::Unsure) => &mut counts.unsure_elsewhere,
+                Some(Presence::Found) | None if a.is_placed() => &mut counts.found,
+                Some(Presence::Found) | None => &mut counts.misled,
+            };
+            *cell += 1;
+            counts.photos += a.photos;
+            counts.located += a.located;
+            counts.iou += a.iou.unwrap_or(0.0) * a.photos as f64;
+        }
+        counts
+    }
+}
