@@ -215,7 +215,7 @@ fn short_table(texts: &[TextAnswers]) -> String {
             text,
             match answers.presence {
                 _ if answers.reading.is_unknown() => "unknown words".to_owned(),
-                Some(Presence::Absent) => "not in this scene".to_owned(),
+                Some(Presence::Absent) => "no sign of it".to_owned(),
                 Some(Presence::Unsure) => "unsure".to_owned(),
                 Some(Presence::Found) | None if best.is_none() => "not found".to_owned(),
                 Some(Presence::Found) | None => "found".to_owned(),

@@ -122,9 +122,9 @@ fn words(report: &HtmlReport) -> Result<String> {
     }
     if report.space.is_some_and(|s| s.starts_with("words")) {
         out.push_str(
-            "<p class=\"small\">Words come from the built-in model: an image classifier that knows about a thousand \
-             everyday things, joined to texts through a small sentence model. It is a light stand-in; CLIP is the full \
-             model. A thing outside its thousand classes may be confused with its nearest relative.</p>",
+            "<p class=\"small\">Words come from the built-in model: an image classifier of about a thousand \
+             everyday things and eight surfaces such as wall and floor, joined to English nouns. It is a light stand-in; \
+             CLIP is the full model.</p>",
         );
     }
     Ok(out)
@@ -216,7 +216,7 @@ mod tests {
             queries: vec![
                 query("<script>", "found in 1 of 1 photos", Certainty::Found),
                 query("tree", "unsure; if it is here, in 1 of 1 photos", Certainty::Unsure),
-                query("moon", "not in this scene", Certainty::Nothing),
+                query("moon", "no sign of it", Certainty::Nothing),
             ],
             curves: vec![
                 Curve { name: "PSNR", unit: "dB", points: vec![(1.0, 21.0), (100.0, 32.456)] },
@@ -250,7 +250,7 @@ mod tests {
             "class=\"yes\">found",
             "class=\"unsure\">unsure; if it is here",
             "a: perhaps what is outlined",
-            "class=\"no\">not in this scene",
+            "class=\"no\">no sign of it",
             "Where the photos stand.",
         ] {
             assert!(html.contains(text), "{text}");

@@ -6,7 +6,7 @@ use crate::query::frame::FrameSearch;
 use crate::query::highlight::{Highlight, highlight};
 use crate::query::instances::{Instance, Places, Visible};
 use crate::query::maps::CodeMaps;
-use crate::query::phrasing::{Phrasing, Reading};
+use crate::query::phrasing::Reading;
 use crate::query::presence::{Background, Evidence, Presence, ShownCodes, ShownPixels};
 use crate::query::select::{Selection, select};
 use crate::query::{self, CanonicalCosines, QueryOptions, QueryResult, TextQuery};
@@ -95,7 +95,7 @@ impl Answers {
 
     /// Notes that the verdict does not contain.
     fn remarks(&self) -> Vec<String> {
-        self.reading.phrasing.iter().map(Phrasing::note).collect()
+        self.reading.notes()
     }
 
     /// Record of the text and its instances, as in `query --json` and run.json; `views` are the
@@ -138,11 +138,11 @@ fn placement_json(i: &Instance, unit: f64) -> Value {
 /// An answer in a few words: "found in 3 of 4 photos".
 pub fn verdict(presence: Option<Presence>, reading: &Reading, found: usize, views: usize) -> String {
     match presence {
-        _ if reading.is_unknown() && found == 0 => {
-            "outside the vocabulary; whether it is here is unknown".to_owned()
+        _ if reading.is_unknown() && found == 0 => "the built-in words do not know it".to_owned(),
+        _ if reading.is_unknown() => {
+            format!("the built-in words do not know it; a guess in {found} of {views} photos")
         }
-        _ if reading.is_unknown() => format!("outside the vocabulary; a guess in {found} of {views} photos"),
-        Some(Presence::Absent) => "not in this scene".to_owned(),
+        Some(Presence::Absent) => "no sign of it".to_owned(),
         Some(Presence::Unsure) => format!("unsure; if it is here, in {found} of {views} photos"),
         Some(Presence::Found) | None => format!("found in {found} of {views} photos"),
     }
@@ -179,7 +179,7 @@ impl Prepared {
     ) -> Option<Evidence> {
         let shown = ShownCodes::new(&self.shown, field, cosines);
         let background = background.get_or_insert_with(|| shown.background(&query.alternatives.things));
-        let evidence = shown.evidence(&query.embedding, &query.alternatives.colours, background);
+        let evidence = shown.evidence(&query.embedding, &query.alternatives, background);
         evidence.map(|e| if query.reading.is_doubtful() { e.in_doubt() } else { e })
     }
 
@@ -271,10 +271,11 @@ impl Prepared {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::infer::PresenceLevels;
     use crate::infer::things;
     use crate::pass::RenderedFrame;
     use crate::query::CANONICAL_PHRASES;
-    use crate::query::phrasing::Vocabulary;
+    use crate::query::phrasing::{Phrasing, Vocabulary};
     use crate::query::presence::Alternatives;
     use crate::scene::{Codebook, Image, LevelField, Pose, Scale};
     use glam::DVec3;
@@ -373,7 +374,11 @@ mod tests {
         }
 
         fn ask_with(&self, text: &str, reading: Reading, options: &QueryOptions) -> Answers {
-            let alternatives = Alternatives { things: self.things.clone(), colours: Vec::new() };
+            let alternatives = Alternatives {
+                things: self.things.clone(),
+                colours: Vec::new(),
+                levels: PresenceLevels::default(),
+            };
             let query = TextQuery { alternatives, reading, ..rule_query(text) };
             let views = (&self.cameras[..], &self.frames[..]);
             self.prepared.answer(&self.field, views, &query, options, &mut None, None).unwrap()
@@ -409,7 +414,7 @@ mod tests {
             assert!(!view.found && !view.mask().data.contains(&true) && a.found() == 0);
             assert!(view.relevancy().data.iter().any(|v| *v > 0.0), "the heat stays");
             assert!(a.instances.is_empty() && a.selection.splats.is_empty() && !a.selection.found);
-            assert_eq!(a.verdict(), "not in this scene");
+            assert_eq!(a.verdict(), "no sign of it");
             let record = a.record(&["a".into()], &World::default());
             assert!(record["presence"] == "absent" && record["p_value"].as_f64().unwrap() >= 0.75);
             assert_eq!(record["instances"], json!([]));
@@ -457,36 +462,35 @@ mod tests {
         assert_eq!(hidden.ask("lemon", Reading::default()).instances[0].pixels, [None]);
     }
 
+    fn unknown() -> Vocabulary {
+        Vocabulary { known: false, nearest: None, not_english: vec!["Zitrone".into()] }
+    }
+
     #[test]
     fn doubtful_reading_is_unsure_at_most() {
         let wall = wall();
         assert_eq!(wall.ask("lemon", Reading::default()).presence, Some(Presence::Found));
         let cut = Phrasing { answers_for: "lemon".into(), not_understood: "on the plate".into() };
-        let unknown = Vocabulary { known: false, nearest: "orange".into() };
-        for (reading, note) in [
+        for (reading, verdict, note) in [
             (
                 Reading { phrasing: Some(cut), vocabulary: None },
+                "unsure; if it is here, in 1 of 1 photos",
                 "answers for “lemon”; “on the plate” is not understood",
             ),
             (
-                Reading { phrasing: None, vocabulary: Some(unknown) },
-                "outside the vocabulary; nearest: “orange”",
+                Reading { phrasing: None, vocabulary: Some(unknown()) },
+                "the built-in words do not know it; a guess in 1 of 1 photos",
+                "“Zitrone” is not among their English words",
             ),
         ] {
             let a = wall.ask("lemon", reading);
             assert_eq!((a.presence, a.found()), (Some(Presence::Unsure), 1));
             assert_eq!(a.reading.notes(), [note]);
-            match a.reading.is_unknown() {
-                true => assert_eq!(a.sentence(), "outside the vocabulary; a guess in 1 of 1 photos"),
-                false => {
-                    assert_eq!(a.sentence(), format!("{}; {note}", a.verdict()));
-                    assert_eq!(a.shown().json()["notes"], json!([note]));
-                }
-            }
+            assert_eq!((a.verdict().as_str(), a.sentence()), (verdict, format!("{verdict}; {note}")));
+            assert_eq!(a.shown().json()["notes"], json!([note]));
             let record = a.record(&["a".into()], &World::default());
-            let noted =
-                if a.reading.phrasing.is_some() { &record["phrasing"] } else { &record["vocabulary"] };
-            assert!(noted["not_understood"] == "on the plate" || noted["nearest"] == "orange", "{record}");
+            let is_cut = record["phrasing"]["not_understood"] == "on the plate";
+            assert!(is_cut || record["vocabulary"]["not_english"] == json!(["Zitrone"]), "{record}");
         }
     }
 
@@ -494,10 +498,9 @@ mod tests {
     fn unknown_text_without_fit_is_unsure_and_shows_nothing() {
         let mut wall = wall();
         wall.things = Arc::new(text_embedding("lemon").repeat(100));
-        let unknown = Vocabulary { known: false, nearest: "orange".into() };
-        let a = wall.ask("lemon", Reading { phrasing: None, vocabulary: Some(unknown) });
+        let a = wall.ask("lemon", Reading { phrasing: None, vocabulary: Some(unknown()) });
         assert_eq!((a.presence, a.found(), a.instances.len()), (Some(Presence::Unsure), 0, 0));
-        assert_eq!(a.sentence(), "outside the vocabulary; whether it is here is unknown");
+        assert_eq!(a.verdict(), "the built-in words do not know it");
         let page = a.shown().json();
         assert!(page["verdict"] == a.verdict() && page["codes"] == json!([]), "{page}");
     }

@@ -27,11 +27,16 @@ fn as_query(
     phrasing::check(text)?;
     let phrasing = if verbatim || encoder.has_table_entry(text) { None } else { phrasing::read(text) };
     let understood = phrasing.as_ref().map_or(text, |p| &p.answers_for).to_owned();
-    let (embedding, nearest) = encoder.embed_with_nearest_word(&understood)?;
+    let (embedding, word) = encoder.embed_and_look_up(&understood)?;
     let form = things::form(&understood);
     let things = alternatives_cache.entry(&form, |form| encoder.embed_other_things(form))?.things.clone();
-    let alternatives = Alternatives { things, colours: encoder.embed_recoloured(&understood)? };
-    let vocabulary = nearest.map(|(known, nearest)| Vocabulary { known, nearest });
+    let (colours, levels) = (encoder.embed_recoloured(&understood)?, encoder.presence_levels());
+    let alternatives = Alternatives { things, colours, levels };
+    let vocabulary = word.map(|word| Vocabulary {
+        known: word.nearest.is_some(),
+        nearest: word.nearest,
+        not_english: word.not_english,
+    });
     let reading = Reading { phrasing, vocabulary };
     Ok(TextQuery { text: text.to_owned(), embedding, canonicals: canonicals.to_vec(), alternatives, reading })
 }

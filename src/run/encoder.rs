@@ -19,8 +19,8 @@ pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncod
         Some((family, _)) => SourceChoice::named(family),
         None => sources::default::<sources::FeatureSources>(),
     };
-    let encoder = sources::encoder(&source, &registry)?;
-    if encoder.space() != space {
+    let mut encoder = sources::encoder(&source, &registry)?;
+    if !encoder.use_space(space) {
         return Err(Error::input(format!(
             "{}: its features are of the space \"{space}\", the installed text model speaks \"{}\"; put {TEXT_EMBEDDINGS} \
              (phrase → vector) into the scene, or make it again",

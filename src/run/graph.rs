@@ -118,6 +118,8 @@ impl ScenePlan<'_> {
                 let matches = sources::make::<MatchSources>(&language.matcher, &registry, (build, posed))?;
                 let regions = stages::RegionFeatures { encoder: query_inputs.encoder.clone() };
                 let regions = self.build.graph.add(regions, (placed, masks));
+                let surfaces = stages::SurfaceFeatures { encoder: query_inputs.encoder.clone() };
+                let regions = self.build.graph.add(surfaces, (placed, regions, geometry));
                 let recipe = language.recipe(self.config.training.preset);
                 let (seed, space) = (self.build.seed, query_inputs.encoder.space().to_owned());
                 let align = stages::Align { recipe, space, seed };
@@ -132,9 +134,9 @@ impl ScenePlan<'_> {
     /// Adds the stages of photos that join a scene.
     pub(super) fn added(&mut self, base: &Arc<BaseScene>, photos: Vec<Photo>) -> Result<SceneOutputs> {
         let (preset, seed, registry) = (self.build.preset, self.build.seed, self.build.registry.clone());
-        let encoder = self.encoder()?;
-        if let Some(encoder) = &encoder
-            && encoder.space() != base.field.space
+        let mut encoder = self.encoder()?;
+        if let Some(encoder) = &mut encoder
+            && !encoder.use_space(&base.field.space)
         {
             return Err(Error::input(format!(
                 "--features: the scene's features are {}, these would be {}; give the --features it was made with",
@@ -168,6 +170,8 @@ impl ScenePlan<'_> {
                 let graph = &mut self.build.graph;
                 let regions = stages::RegionFeatures { encoder: query_inputs.encoder.clone() };
                 let regions = graph.add(regions, (new.placed, masks));
+                let surfaces = stages::SurfaceFeatures { encoder: query_inputs.encoder.clone() };
+                let regions = graph.add(surfaces, (new.placed, regions, new.geometry));
                 let recipe = language.recipe(self.config.training.preset);
                 let options = recipe.build(query_inputs.encoder.space(), seed);
                 let align = stages::AlignAdded { base: base.clone(), options };

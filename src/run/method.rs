@@ -6,8 +6,9 @@ use crate::fit::{
     self, FeatureStorage, LanguageOptions, Photos, Preset, RgbOptions, Start, TrainedLanguage, index_head,
 };
 use crate::gpu::Device;
+use crate::infer::words;
 use crate::language::align::AlignOptions;
-use crate::language::{BuildOptions, Reducer};
+use crate::language::{BuildOptions, Pooling, Reducer};
 use crate::progress::Progress;
 use crate::scene::{Camera, LanguageField, Splats};
 use crate::{Error, Result};
@@ -178,6 +179,7 @@ impl Recipe {
             },
             reducer: self.reducer,
             feature_dim: self.feature_dim,
+            pooling: if words::is_space(space) { Pooling::Agreement } else { Pooling::Medoid },
             space: space.to_owned(),
             seed,
         }

@@ -121,7 +121,7 @@ fn figures(o: &RunOutcome) -> Vec<Figure> {
         let meaning =
             "What the scene is divided into. A click selects one; a thing may still be several that touch.";
         list.push(Figure::that_matters("things", text, meaning));
-        if language.field.space == words::SPACE {
+        if words::is_space(&language.field.space) {
             let text = "the built-in ones; `splatvk models fetch open` installs better ones".to_owned();
             let meaning = "A stand-in for a language network: English names of about a thousand everyday things, and colours. \
                            An answer about anything else is a guess.";

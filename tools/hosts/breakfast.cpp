@@ -54,7 +54,7 @@ static int run(int argc, char **argv) {
     check(svk_scene_query(scene.get(), "lemon", &camera, &answer, mask.data(), mask.size()), scene.get());
     std::printf("lemon: %s, score %.2f at (%.1f, %.1f), %llu pixels\n", answer.found ? "found" : "not found", answer.score,
                 answer.x, answer.y, static_cast<unsigned long long>(answer.mask_pixels));
-    const char *presences[] = {"the text model cannot tell", "found", "unsure", "not in this scene"};
+    const char *presences[] = {"the text model cannot tell", "found", "unsure", "no sign of it"};
     std::printf("in the scene: %s (p = %.3f), %u of it\n", presences[answer.presence], answer.p_value, answer.instances);
     std::vector<SvkInstance> things(answer.instances, make<SvkInstance>());
     size_t count = 0;

@@ -34,6 +34,7 @@ pub mod depth_prior;
 pub mod graph;
 pub mod hed;
 pub mod installed;
+mod lexicon;
 mod library;
 mod multiview;
 pub mod onnx;
@@ -43,6 +44,7 @@ pub mod provider;
 mod registry;
 mod runtime;
 pub mod sam;
+pub mod stuff;
 #[cfg(test)]
 mod tests;
 pub mod text;
@@ -96,6 +98,33 @@ fn cosines(v: &[f32], rows: &[f32]) -> Vec<f32> {
     all
 }
 
+/// Levels of the presence test on p-values: the share of other things that fit a scene at least as
+/// well as a text does.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PresenceLevels {
+    /// Largest p-value of a found text. Of texts that are not in the scene, at most this share is
+    /// called found if they are exchangeable with the other things.
+    pub found: f32,
+    /// Smallest p-value of a text of which there is no sign.
+    pub absent: f32,
+}
+
+impl Default for PresenceLevels {
+    /// Five of a hundred; three of four other things fit better.
+    fn default() -> Self {
+        PresenceLevels { found: 0.05, absent: 0.75 }
+    }
+}
+
+/// Look-up of a text in a vocabulary.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct KnownWord {
+    /// The word of the vocabulary that the text means most; `None` for a text outside of it.
+    pub nearest: Option<String>,
+    /// Words of an unknown text that are not English.
+    pub not_english: Vec<String>,
+}
+
 /// Embeds image regions and texts in one space of unit vectors, so that a cosine measures how well
 /// a phrase names a region. Implemented by `words` (the built-in default) and by user-supplied
 /// CLIP-like pairs of towers.
@@ -114,6 +143,16 @@ pub trait RegionEncoder: Send {
         count: usize,
         progress: &dyn Progress,
     ) -> Result<Vec<f32>>;
+    /// Adds the shapes of regions to their [`RegionEncoder::embed_regions`] rows, for encoders that
+    /// name surfaces by shape.
+    fn add_surfaces(&mut self, _features: &mut [f32], _surfaces: &[stuff::Surface]) -> Result<()> {
+        Ok(())
+    }
+    /// Changes to another revision of the encoder's space; `false` if the encoder has none of this
+    /// name.
+    fn use_space(&mut self, space: &str) -> bool {
+        self.space() == space
+    }
     /// [texts.len(), D] row-major unit vectors.
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>>;
     /// [N, D] unit rows of [`things::of_form`]; fewer or none from an encoder of a limited set of
@@ -128,19 +167,22 @@ pub trait RegionEncoder: Send {
         let list = things::recoloured(text);
         self.embed_texts(&list.iter().map(String::as_str).collect::<Vec<_>>())
     }
+    /// Levels of the presence test for texts of this encoder.
+    fn presence_levels(&self) -> PresenceLevels {
+        PresenceLevels::default()
+    }
     /// Whether the text is an entry of the encoder's table, which must not be split into words.
     fn has_table_entry(&self, _text: &str) -> bool {
         false
     }
-    /// Whether a text is in the encoder's vocabulary, and its nearest word there; `None` from an
-    /// encoder without a fixed vocabulary.
-    fn find_nearest_word(&mut self, _text: &str) -> Result<Option<(bool, String)>> {
+    /// Looks up a text in the encoder's vocabulary; `None` from an encoder without a fixed one.
+    fn look_up(&mut self, _text: &str) -> Result<Option<KnownWord>> {
         Ok(None)
     }
-    /// The embedding [D] of a text, and [`RegionEncoder::find_nearest_word`] of it, for encoders that
-    /// share work between the two.
-    fn embed_with_nearest_word(&mut self, text: &str) -> Result<(Vec<f32>, Option<(bool, String)>)> {
-        Ok((self.embed_texts(&[text])?, self.find_nearest_word(text)?))
+    /// The embedding [D] of a text, and [`RegionEncoder::look_up`] of it, for encoders that share
+    /// work between the two.
+    fn embed_and_look_up(&mut self, text: &str) -> Result<(Vec<f32>, Option<KnownWord>)> {
+        Ok((self.embed_texts(&[text])?, self.look_up(text)?))
     }
     /// Name of the table or network that embedded a text; `None` from an encoder with a single one.
     fn embedding_source(&self, _text: &str) -> Option<String> {

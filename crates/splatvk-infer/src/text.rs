@@ -36,6 +36,11 @@ impl TextEncoder {
         Ok(encoded.get_ids().iter().map(|id| i64::from(*id)).collect())
     }
 
+    /// Whether a word is one token: the tokenizer cuts words that are not English, and rare ones.
+    pub fn is_word(&self, word: &str) -> Result<bool> {
+        Ok(self.tokens(word)?.len() == 3)
+    }
+
     /// Unit embedding [384] of one text.
     pub fn embed(&mut self, text: &str) -> Result<Vec<f32>> {
         let tokens = self.tokens(text)?;

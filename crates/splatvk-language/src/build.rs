@@ -3,7 +3,7 @@ use super::ViewMasks;
 use super::align::{self, AlignOptions, Alignment, Component, PairLinks, links_from_depth};
 use super::codebook::{self, CodeEntry, EncodedLevel, autoencoder, quantise};
 use crate::progress::Progress;
-use crate::scene::{Camera, DepthMap, Image, LanguageField, LevelField};
+use crate::scene::{Camera, DepthMap, Image, LanguageField, LevelField, MaskId};
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -24,6 +24,17 @@ pub enum Reducer {
     Quantised,
 }
 
+/// How the features of a component's masks become the embedding of its code.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Pooling {
+    /// The feature of the medoid, a unit vector.
+    Medoid,
+    /// The mean, shorter the less the masks agree and the fewer they are: a classifier errs in a
+    /// different way in each photo.
+    Agreement,
+}
+
 /// Options of [`build`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct BuildOptions {
@@ -33,6 +44,8 @@ pub struct BuildOptions {
     pub reducer: Reducer,
     /// d, the length of the codes that splats carry.
     pub feature_dim: usize,
+    /// Embedding of a code.
+    pub pooling: Pooling,
     /// Identifies the embedding space, for [`LanguageField::space`].
     pub space: String,
     /// Seed of the code layout.
@@ -47,6 +60,7 @@ impl Default for BuildOptions {
             align: AlignOptions::default(),
             reducer: Reducer::Bijection,
             feature_dim: 16,
+            pooling: Pooling::Medoid,
             space: String::new(),
             seed: 0,
         }
@@ -121,7 +135,7 @@ fn check_sizes(masks: &[ViewMasks], cameras: &[Camera], depths: &[DepthMap]) -> 
 fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress) -> Result<LanguageField> {
     let mut field = LanguageField { levels: Vec::new(), space: options.space.clone() };
     let entries: Vec<Vec<CodeEntry>> =
-        (0..alignment.components.len()).map(|l| entries(alignment, l)).collect();
+        (0..alignment.components.len()).map(|l| entries(alignment, l, options.pooling)).collect();
     let built = match options.reducer {
         Reducer::Bijection => {
             let encode = |e: &Vec<CodeEntry>| codebook::build(e, options.feature_dim, options.seed);
@@ -159,20 +173,40 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
 }
 
 /// Embedding, weight and members of every component of a level.
-fn entries(alignment: &Alignment, level: usize) -> Vec<CodeEntry> {
+fn entries(alignment: &Alignment, level: usize, pooling: Pooling) -> Vec<CodeEntry> {
     let components = alignment.components[level].iter();
     let entries = components.map(|c| CodeEntry {
-        embedding: medoid_feature(alignment, level, c).to_vec(),
+        embedding: pooled_feature(alignment, level, c, pooling),
         weight: c.weight,
         members: c.members.clone(),
     });
     entries.collect()
 }
 
-/// Feature of a component's medoid, [D].
-pub(super) fn medoid_feature<'a>(alignment: &'a Alignment, level: usize, c: &Component) -> &'a [f32] {
-    let masks = &alignment.views[c.medoid.view as usize].levels[level];
-    let dim = masks.features.len() / masks.quality.len().max(1);
-    let start = c.medoid.mask as usize * dim;
-    &masks.features[start..start + dim]
+/// Masks without a feature that are added to the mean of [`Pooling::Agreement`].
+const DOUBT: f32 = 0.5;
+
+/// Feature of a component, [D].
+pub(super) fn pooled_feature(
+    alignment: &Alignment,
+    level: usize,
+    c: &Component,
+    pooling: Pooling,
+) -> Vec<f32> {
+    let feature = |mask: &MaskId| {
+        let masks = &alignment.views[mask.view as usize].levels[level];
+        let dim = masks.features.len() / masks.quality.len().max(1);
+        &masks.features[mask.mask as usize * dim..][..dim]
+    };
+    match pooling {
+        Pooling::Medoid => feature(&c.medoid).to_vec(),
+        Pooling::Agreement => {
+            let mut mean = vec![0.0; feature(&c.medoid).len()];
+            let weight = 1.0 / (c.members.len() as f32 + DOUBT);
+            for member in &c.members {
+                mean.iter_mut().zip(feature(member)).for_each(|(m, v)| *m += weight * v);
+            }
+            mean
+        }
+    }
 }

@@ -4,8 +4,9 @@
 //! Codes are rendered from the camera of a new photo. The alignment that joins masks of two photos
 //! then joins the photo's masks with the rendered codes.
 use super::align::{self, Alignment, Component, PairLinks, links_from_depth, links_from_overlay};
-use super::build::{BuildOptions, Language, medoid_feature};
+use super::build::{BuildOptions, Language, Pooling, pooled_feature};
 use super::codebook::{self, CodeEntry};
+use super::dir::normalise_rows;
 use super::{LevelMasks, ViewMasks};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, Image, LanguageField, LevelField, MaskId};
@@ -41,11 +42,12 @@ impl SceneView<'_> {
 
     /// The rendered codes as masks, each with the embedding of its code.
     fn masks(&self, field: &LanguageField) -> ViewMasks {
-        let levels = self.codes.iter().zip(&field.levels).map(|(labels, level)| LevelMasks {
-            labels: labels.clone(),
-            quality: vec![1.0; level.codebook.len()],
-            features: level.codebook.embeddings.clone(),
-            ..LevelMasks::default()
+        let levels = self.codes.iter().zip(&field.levels).map(|(labels, level)| {
+            let mut features = level.codebook.embeddings.clone();
+            // Those of [`Pooling::Agreement`] are shorter.
+            normalise_rows(&mut features, level.codebook.embedding_dim);
+            let quality = vec![1.0; level.codebook.len()];
+            LevelMasks { labels: labels.clone(), quality, features, ..LevelMasks::default() }
         });
         ViewMasks { levels: levels.collect() }
     }
@@ -83,7 +85,8 @@ pub fn join(
     progress.check()?;
     let mut out = LanguageField { levels: Vec::new(), space: field.space.clone() };
     for (level, own) in field.levels.iter().enumerate() {
-        let state = Level { level, field: own, new, same: &same, alignment: &alignment };
+        let state =
+            Level { level, field: own, new, same: &same, alignment: &alignment, pooling: options.pooling };
         let (codebook, mut targets) = state.join(known.len(), options)?;
         let mut all: Vec<Image<i32>> = known.iter().map(|codes| codes[level].clone()).collect();
         all.append(&mut targets);
@@ -101,6 +104,7 @@ struct Level<'a> {
     new: &'a [SceneView<'a>],
     same: &'a [Vec<bool>],
     alignment: &'a Alignment,
+    pooling: Pooling,
 }
 
 impl Level<'_> {
@@ -192,7 +196,7 @@ impl Level<'_> {
         let n = self.new.len() as u32;
         let global = |m: &MaskId| MaskId { view: m.view - n + known as u32, mask: m.mask };
         CodeEntry {
-            embedding: medoid_feature(self.alignment, self.level, component).to_vec(),
+            embedding: pooled_feature(self.alignment, self.level, component, self.pooling),
             weight: component.weight,
             members: component.members.iter().filter(|m| m.view >= n).map(global).collect(),
         }

@@ -30,8 +30,9 @@ mod masks;
 pub mod matcher;
 pub mod query;
 pub mod sam;
+pub mod surfaces;
 
-pub use build::{BuildOptions, Language, Reducer, build};
+pub use build::{BuildOptions, Language, Pooling, Reducer, build};
 pub use join::{SceneView, join};
 pub use masks::{LevelMasks, ViewMasks};
 pub(crate) use splatvk_io::{format, photo};

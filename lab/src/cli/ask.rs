@@ -1,6 +1,6 @@
 //! `splatlab ask`
 use super::args::AskArgs;
-use crate::protocol::{Asked, Counts, Kind, Photographs};
+use crate::protocol::{Asked, Counts, Kind, Named, Photographs};
 use crate::{Error, Result};
 use serde_json::json;
 use splatvk::cli::print::{print, print_json};
@@ -24,12 +24,25 @@ pub fn ask(args: &AskArgs) -> Result<()> {
     let device = gpu::open(args.device.device.as_deref())?;
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
     let asked = photographs.ask(&mut ready, &QueryOptions::default())?;
+    let named = photographs.names(&mut ready)?;
     ready.encoder().embedding_warning().iter().for_each(|warning| progress::print_warning(warning));
     if args.device.json {
         let counts = KINDS.map(|kind| json!({ "kind": kind, "counts": Counts::of(&asked, kind) }));
-        return print_json(&json!({ "scene": args.scene, "asked": asked, "summary": counts }));
+        return print_json(
+            &json!({ "scene": args.scene, "asked": asked, "named": named, "summary": counts }),
+        );
     }
-    print(&table(&asked))
+    print(&(table(&asked) + &names(&named)))
+}
+
+fn names(named: &[Named]) -> String {
+    let mut out = String::new();
+    for n in named {
+        let [own, next] = n.relevancy;
+        let mark = if n.right { "right" } else { "wrong" };
+        let _ = writeln!(out, "{:24} {mark}: {} {own:.3}, next {next:.3}", n.category, n.name);
+    }
+    out
 }
 
 const KINDS: [Kind; 3] = [Kind::Category, Kind::Synonym, Kind::Absent];

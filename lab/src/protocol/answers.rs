@@ -4,6 +4,7 @@ use super::lerf::{self, Target};
 use super::score::mask_iou;
 use crate::{Error, Result};
 use serde::{Deserialize, Serialize};
+use splatvk::infer::words;
 use splatvk::photo::stem;
 use splatvk::query::QueryOptions;
 use splatvk::query::presence::Presence;
@@ -134,6 +135,53 @@ impl Photographs {
             located,
             iou: (photos > 0).then(|| overlap / photos as f64),
         })
+    }
+}
+
+/// The name of a labelled thing in one photo.
+#[derive(Clone, Debug, Serialize)]
+pub struct Named {
+    /// The category.
+    pub category: String,
+    /// Best name of the code of level l in the middle of the thing.
+    pub name: String,
+    /// Its relevancy, and that of the next name with another noun.
+    pub relevancy: [f32; 2],
+    /// Whether the category is of the kind of the name.
+    pub right: bool,
+}
+
+impl Photographs {
+    /// Names of the labelled things whose category is in the vocabulary, in the photos of the last
+    /// [`Photographs::ask`].
+    pub fn names(&self, scene: &mut QueryScene) -> Result<Vec<Named>> {
+        let level = scene.field().levels.len().saturating_sub(1);
+        let names = scene.names()?;
+        let mut named = Vec::new();
+        for ((_, targets), frame) in self.frames.iter().zip(scene.frames()) {
+            let Some(map) = frame.maps.levels.get(level) else { continue };
+            for (category, target) in targets.iter().filter(|(c, _)| words::are_of_one_kind(c, c)) {
+                let truth = &target.mask;
+                let pixels: Vec<usize> = (0..truth.data.len()).filter(|p| truth.data[*p]).collect();
+                let Some(middle) = pixels.get(pixels.len() / 2) else { continue };
+                let scaled = |p: usize, from: usize, to: usize| (2 * p + 1) * to / (2 * from);
+                let (x, y) = (middle % truth.width, middle / truth.width);
+                let (x, y) =
+                    (scaled(x, truth.width, frame.maps.width), scaled(y, truth.height, frame.maps.height));
+                let code = usize::from(map.codes[y * frame.maps.width + x]);
+                let list = names[level].get(code).map_or(&[][..], Vec::as_slice);
+                let Some((name, relevancy)) = list.first() else { continue };
+                let noun = |name: &str| name.rsplit(' ').next().unwrap_or_default().to_owned();
+                let next = list.iter().find(|n| noun(&n.0) != noun(name)).map_or(0.0, |n| n.1);
+                named.push(Named {
+                    category: category.clone(),
+                    name: name.clone(),
+                    relevancy: [*relevancy, next],
+                    right: words::are_of_one_kind(category, name),
+                });
+            }
+        }
+        Ok(named)
     }
 }
 

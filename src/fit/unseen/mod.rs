@@ -9,7 +9,7 @@ mod anchor;
 mod backdrop;
 
 use crate::math::Random;
-use crate::scene::{Camera, DepthMap, RgbImage, SH_C0, Splats};
+use crate::scene::{Camera, DepthMap, RgbImage, SH_C0, Sky, Splats};
 pub(super) use backdrop::backdrop;
 
 use super::options::RgbOptions;
@@ -112,40 +112,6 @@ fn unseen_splats(
     splats
 }
 
-/// Everything but sky is nearer than this share of the sky's distance, with a margin; stereo keeps
-/// two thirds.
-const NEARER: f64 = 0.75;
-
-/// The sphere on which stereo places the sky.
-struct Sky {
-    centre: DVec3,
-    radius: f64,
-}
-
-impl Sky {
-    /// The sphere of the farthest depth, if nothing is between it and [`NEARER`]: surfaces reach
-    /// into the distance without such a gap.
-    fn of(cameras: &[Camera], depths: &[DepthMap]) -> Option<Sky> {
-        let centre = cameras.iter().map(|c| c.pose.centre()).sum::<DVec3>() / cameras.len().max(1) as f64;
-        let distances: Vec<f64> = cameras
-            .iter()
-            .zip(depths)
-            .flat_map(|(camera, map)| {
-                let known = (0..map.depth.data.len()).step_by(7).filter(|i| map.depth.data[*i] > 0.0);
-                known.map(move |i| {
-                    let (x, y) = (i % map.depth.width, i / map.depth.width);
-                    let pixel = DVec2::new(x as f64 + 0.5, y as f64 + 0.5);
-                    camera.unproject(pixel, f64::from(map.depth.data[i])).distance(centre)
-                })
-            })
-            .collect();
-        let radius = distances.iter().copied().reduce(f64::max)?;
-        let on_sphere = distances.iter().filter(|d| **d > 0.99 * radius).count();
-        let between = distances.iter().filter(|d| (NEARER * radius..0.99 * radius).contains(*d)).count();
-        (between == 0 && 200 * on_sphere > distances.len()).then_some(Sky { centre, radius })
-    }
-}
-
 /// Candidates around one photo and behind its surfaces, up to `reach` pixels from the end of a
 /// surface.
 fn candidates(
@@ -164,7 +130,7 @@ fn candidates(
     // size would shine through every gap of the ground.
     edges.retain(|a| {
         let point = shown.camera.unproject(a.at, 1.0 / a.w);
-        sky.is_none_or(|sky| point.distance(sky.centre) < NEARER * sky.radius)
+        sky.is_none_or(|sky| !sky.contains(point))
     });
     let continued = |anchor: &Anchor, pixel: DVec2, step: f64, reach: f64| {
         candidate(shown.camera, anchor, pixel, reach, step)

@@ -39,6 +39,17 @@ impl SharedEncoder {
         &self.space
     }
 
+    /// Changes to another revision of the encoder's space; `false` if the encoder has none of this
+    /// name.
+    pub fn use_space(&mut self, space: &str) -> bool {
+        let known = self.with(|e| e.use_space(space));
+        if known && self.space != space {
+            self.identity = format!("{space} {}", self.identity);
+            self.space = space.to_owned();
+        }
+        known
+    }
+
     /// The encoder itself, if nothing else shares it.
     pub fn into_inner(self) -> Result<Box<dyn RegionEncoder>> {
         let alone = Arc::into_inner(self.encoder).ok_or_else(|| Error::work("the encoder is in use"))?;

@@ -5,12 +5,15 @@ use super::shared;
 use crate::Result;
 use crate::infer::hed::Hed;
 use crate::infer::installed::Installed;
+use crate::infer::words;
 use crate::language::sam::{self, SamOptions};
+use crate::language::surfaces::Surfaces;
 use crate::language::{ViewMasks, dir, graph};
 use crate::photo::Photo;
 use crate::pipeline::{Codec, Context, Lane, Output, Stage, kept};
+use crate::pose::{Geometry, upright};
 use crate::progress::Progress;
-use crate::scene::{Image, RgbImage};
+use crate::scene::{CameraOrbit, Image, RgbImage};
 use rayon::prelude::*;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -211,6 +214,47 @@ impl Stage for RegionFeatures {
             view.levels.iter_mut().for_each(|level| level.keep(|i| photo.uses(i)));
         }
         describe(&mut masks, images, &self.encoder, context.progress)?;
+        Ok(masks)
+    }
+}
+
+/// Adds the shapes of the masks' surfaces to their features.
+pub struct SurfaceFeatures {
+    /// Encoder of the features.
+    pub encoder: SharedEncoder,
+}
+
+impl Stage for SurfaceFeatures {
+    const NAME: &'static str = "surfaces";
+    const LANE: Lane = Lane::Processor;
+    type Inputs = (Output<PlacedPhotos>, Output<Vec<ViewMasks>>, Output<Geometry>);
+    type Output = Vec<ViewMasks>;
+
+    fn settings(&self) -> String {
+        self.encoder.identity().to_owned()
+    }
+
+    fn run(
+        self,
+        (placed, masks, geometry): (&PlacedPhotos, &Vec<ViewMasks>, &Geometry),
+        context: &Context,
+    ) -> Result<Vec<ViewMasks>> {
+        let mut masks = masks.clone();
+        if !words::is_space(self.encoder.space()) {
+            return Ok(masks);
+        }
+        let images: Vec<&RgbImage> = placed.photos.iter().map(|p| &p.image).collect();
+        let gravity: Vec<_> = placed.photos.iter().map(|p| p.gravity).collect();
+        let up = upright::up(&images, &geometry.cameras, &geometry.points, &gravity).map(|up| up.direction);
+        let up = up.unwrap_or_else(|| CameraOrbit::mean_up(&geometry.cameras).normalize_or_zero());
+        let surfaces = Surfaces::new(&images, &geometry.cameras, &geometry.depths, up);
+        for (view, view_masks) in masks.iter_mut().enumerate() {
+            for level in &mut view_masks.levels {
+                context.progress.check()?;
+                let shapes = surfaces.of_regions(view, &level.labels, level.quality.len());
+                self.encoder.with(|e| e.add_surfaces(&mut level.features, &shapes))?;
+            }
+        }
         Ok(masks)
     }
 }

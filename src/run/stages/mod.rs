@@ -14,7 +14,9 @@ pub use added::{AddedCameras, AddedDepth, AlignAdded, KnownUp, OnlyAdded, OnlyAd
 pub use answers::{AnswerQueries, DecodeViews};
 pub use cameras::{CameraOrigin, Cameras, DenseDepth, KnownGeometry, PlacedPhotos, Upright};
 pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage};
-pub use masks::{ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures};
+pub use masks::{
+    ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures, SurfaceFeatures,
+};
 pub use matches::{DescriptorMatches, Descriptors, NetworkMatches};
 pub use prior::{DepthPriors, PriorOrigin};
 pub use shared::{identity, keypoints};

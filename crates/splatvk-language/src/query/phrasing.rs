@@ -81,8 +81,18 @@ impl Phrasing {
 pub struct Vocabulary {
     /// Whether the text is in the vocabulary.
     pub known: bool,
-    /// Nearest word of the vocabulary.
-    pub nearest: String,
+    /// Word of the vocabulary that the text means most; `None` outside of it.
+    pub nearest: Option<String>,
+    /// Words of an unknown text that are not English.
+    pub not_english: Vec<String>,
+}
+
+impl Vocabulary {
+    /// Note for the user on an unknown text.
+    fn note(&self) -> Option<String> {
+        let words: Vec<String> = self.not_english.iter().map(|w| format!("“{w}”")).collect();
+        (!words.is_empty()).then(|| format!("{} is not among their English words", words.join(", ")))
+    }
 }
 
 /// Interpretation of a text.
@@ -108,8 +118,7 @@ impl Reading {
 
     /// Note for the user, one line each.
     pub fn notes(&self) -> Vec<String> {
-        let unknown = self.vocabulary.as_ref().filter(|v| !v.known);
-        let unknown = unknown.map(|v| format!("outside the vocabulary; nearest: “{}”", v.nearest));
+        let unknown = self.vocabulary.as_ref().and_then(Vocabulary::note);
         self.phrasing.as_ref().map(Phrasing::note).into_iter().chain(unknown).collect()
     }
 }

@@ -7,20 +7,12 @@ use crate::math::dot_f32 as dot;
 use crate::scene::LanguageField;
 use rayon::prelude::*;
 use serde::Serialize;
+use splatvk_infer::PresenceLevels;
 use std::sync::Arc;
 
 /// Smallest number n of other things for a test: the smallest p-value, 1 / (1 + n), is below
-/// [`FOUND`].
+/// the level of found texts.
 pub const MIN_OTHERS: usize = 20;
-
-/// Largest p-value of a found text: the level of the conformal test. Of texts that are not in the
-/// scene, at most this share is called found if they are exchangeable with the other things.
-pub const FOUND: f32 = 0.05;
-
-/// Smallest p-value of an absent text: three of four other things fit better. In `breakfast` and
-/// five generated scenes (tuning; built-in words), one in sixteen things that are present is above,
-/// and one in seven that are not.
-const ABSENT: f32 = 0.75;
 
 /// Smallest share of all pixels of a code. Smaller codes are specks, which match any text by
 /// chance.
@@ -33,6 +25,8 @@ pub struct Alternatives {
     pub things: Arc<Vec<f32>>,
     /// [M, D] unit rows of the same thing in other colours.
     pub colours: Vec<f32>,
+    /// Levels of the test.
+    pub levels: PresenceLevels,
 }
 
 /// Presence of a thing in a scene.
@@ -43,7 +37,7 @@ pub enum Presence {
     Found,
     /// The features do not decide.
     Unsure,
-    /// It is not in the scene.
+    /// There is no sign of it: it fits no better than most other things.
     Absent,
 }
 
@@ -136,22 +130,27 @@ impl<'f> ShownCodes<'f> {
         Background { scores: scores.collect() }
     }
 
-    /// Tests a text against the margins of other things and its embeddings in other colours
-    /// ([`Alternatives::colours`]); `None` with fewer than [`MIN_OTHERS`] other things or without a
+    /// Tests a text against the margins of other things; `alternatives` has its other colours and
+    /// the levels. `None` with fewer than [`MIN_OTHERS`] other things or without a
     /// visible code.
-    pub fn evidence(&self, text: &[f32], colours: &[f32], background: &Background) -> Option<Evidence> {
+    pub fn evidence(
+        &self,
+        text: &[f32],
+        alternatives: &Alternatives,
+        background: &Background,
+    ) -> Option<Evidence> {
         if background.scores.len() < MIN_OTHERS {
             return None;
         }
         let (code, own) = self.best(text)?;
         // "green mug" whose best code is a blue mug.
         let fit = dot(code, text);
-        let other_colour = colours.chunks_exact(code.len()).any(|c| dot(code, c) > fit);
+        let other_colour = alternatives.colours.chunks_exact(code.len()).any(|c| dot(code, c) > fit);
         let better = background.scores.iter().filter(|other| **other >= own).count();
         let p_value = (1 + better) as f32 / (1 + background.scores.len()) as f32;
         let presence = match p_value {
-            p if p <= FOUND && !other_colour => Presence::Found,
-            p if p < ABSENT => Presence::Unsure,
+            p if p <= alternatives.levels.found && !other_colour => Presence::Found,
+            p if p < alternatives.levels.absent => Presence::Unsure,
             _ => Presence::Absent,
         };
         Some(Evidence { presence, p_value })

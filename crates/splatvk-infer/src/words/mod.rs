@@ -5,70 +5,56 @@
 //! | block | region | text |
 //! |---|---|---|
 //! | meaning, 384 | mean of the class names' sentence embeddings under the class posterior `p` | the text's sentence embedding |
-//! | classes, 1000 | `√p` | `√w`, `w = softmax(cosine to each class name / 0.03)` |
+//! | classes, 1000 | `√p` | `√w`, `w` on the classes of its noun |
 //! | colour, 11 | colour terms of its pixels | colour words in the text |
+//! | stuff, 8 | `√p` of wall, floor, sky, … by shape | `√w` |
 //!
-//! The class block separates things: a dot product of square roots is a Bhattacharyya coefficient,
-//! and the steep softmax selects the class that the phrase means, not all vaguely similar ones. The
-//! meaning block ranks things that no class names. Sentence embeddings have the mean of the class
-//! names removed, which carries no information.
+//! Classes and stuff share one posterior and one share of the squared length. The class block
+//! separates things: a dot product of square roots is a Bhattacharyya coefficient. A text means the
+//! classes that are of the kind of its noun ([`lexicon`]); one without a known noun means those with
+//! the nearest names, by a steep softmax. The meaning block ranks things that no class names.
+//! Sentence embeddings have the mean of the class names removed, which carries no information.
 //!
 //! A last coordinate, zero for regions, completes a text to unit length: a text that resembles no
 //! class ("object", "stuff": softmax against a constant 0.55) and names no colour is nearly
 //! orthogonal to every region, as the canonical phrases of the relevancy score should be.
 //!
-//! It covers about a thousand everyday things and eleven colours. CLIP is the full model.
-use super::cache::OutputKey;
+//! It covers about a thousand everyday things, eight surfaces and eleven colours. CLIP is the full
+//! model. Scenes of the space `words-1` have no stuff block.
+mod row;
+mod vocabulary;
+
 use super::classify::{CLASSES, Classifier};
 use super::registry::{PackFileKind, Registry};
-use super::text::{self, TextEncoder, normalise};
-use super::{RegionEncoder, colour, cosines, nearest, things};
+use super::stuff::{self, Surface};
+use super::text::{self, normalise};
+use super::{KnownWord, PresenceLevels, RegionEncoder, colour, lexicon, nearest, things};
+use crate::Result;
 use crate::progress::{Progress, Silent};
 use crate::scene::{Image, RgbImage};
-use crate::{Error, Result, files};
 use rayon::prelude::*;
+use row::{CLASSES_AT, COLOUR_AT, MEANING_AT, SHARES, SPACES, add_stuff, fill, probability};
+use vocabulary::{Vocabulary, text_key};
 
-const MEANING_AT: usize = 0;
-const CLASSES_AT: usize = text::DIM;
-const COLOUR_AT: usize = CLASSES_AT + CLASSES;
-const REST_AT: usize = COLOUR_AT + colour::COUNT;
 /// Name of the embedding space.
-pub const SPACE: &str = "words-1";
+pub const SPACE: &str = SPACES[0].0;
 /// Length of an embedding.
-pub const DIM: usize = REST_AT + 1;
+pub const DIM: usize = SPACES[0].1;
 
-/// Shares of the squared length: meaning, classes, colour. Measured on breakfast (40 phrase–view
-/// pairs, perfect masks): 36 to 39 right for meaning 0.1–0.25, colour 0.3; 28 without colour; 24
-/// without the class block.
-const SHARES: [f32; 3] = [0.15, 0.55, 0.3];
-/// Softness of the step from text to classes; 0.03 to 0.05 measured equally good, 0.1 worse.
-const SOFTNESS: f32 = 0.03;
-/// Cosine to a class name from which a text counts as meaning that class: "object", "things",
-/// "stuff" and "texture" stay below 0.37, "blue mug" reaches 0.7 with "coffee mug". 0.5 to 0.6
-/// measured equally good.
-const THRESHOLD: f32 = 0.55;
+/// Whether a space is that of the built-in words, of any revision.
+pub fn is_space(name: &str) -> bool {
+    SPACES.iter().any(|(space, _)| *space == name)
+}
 
-/// Cosine to the nearest class name, without colours, from which a text is in the vocabulary. Of a
-/// hundred texts that name no thing ("inflation", "Wednesday") five reach it: the level of a
-/// conformal test. So do 65 % of the classes' 860 other names and of the 980 everyday [`things`].
-const KNOWN: f32 = 0.46;
+/// Least probability of a class that names a region.
+const NAMED: f32 = 0.2;
 
 /// The encoder. Networks are loaded when first needed.
 pub struct RegionWords {
     registry: Registry,
     classifier: Option<Classifier>,
     vocabulary: Option<Vocabulary>,
-}
-
-/// The sentence encoder and its embeddings of the class names.
-struct Vocabulary {
-    encoder: TextEncoder,
-    /// [384] mean of the class names' embeddings.
-    mean: Vec<f32>,
-    /// [1000, 384] unit embeddings of the class names, less the mean.
-    names: Vec<f32>,
-    /// [1000] the names.
-    list: Vec<String>,
+    space: (&'static str, usize),
 }
 
 impl RegionWords {
@@ -79,7 +65,7 @@ impl RegionWords {
         {
             registry.path(kind)?;
         }
-        Ok(RegionWords { registry, classifier: None, vocabulary: None })
+        Ok(RegionWords { registry, classifier: None, vocabulary: None, space: SPACES[0] })
     }
 
     fn vocabulary(&mut self, progress: &dyn Progress) -> Result<&mut Vocabulary> {
@@ -93,11 +79,17 @@ impl RegionWords {
 
 impl RegionEncoder for RegionWords {
     fn space(&self) -> &str {
-        SPACE
+        self.space.0
     }
 
     fn dim(&self) -> usize {
-        DIM
+        self.space.1
+    }
+
+    fn use_space(&mut self, space: &str) -> bool {
+        let known = SPACES.into_iter().find(|known| known.0 == space);
+        self.space = known.unwrap_or(self.space);
+        known.is_some()
     }
 
     fn embed_regions(
@@ -113,10 +105,11 @@ impl RegionEncoder for RegionWords {
         };
         let posteriors = self.classifier.insert(classifier).regions(image, labels, count, progress)?;
         let colours = region_colours(image, labels, count);
+        let dim = self.dim();
         let names = &self.vocabulary(progress)?.names;
-        let mut all = vec![0f32; count * DIM];
+        let mut all = vec![0f32; count * dim];
         for ((row, posterior), shown) in
-            all.chunks_exact_mut(DIM).zip(posteriors.chunks_exact(CLASSES)).zip(&colours)
+            all.chunks_exact_mut(dim).zip(posteriors.chunks_exact(CLASSES)).zip(&colours)
         {
             let Some(shown) = shown else { continue };
             let mut meaning = vec![0f32; text::DIM];
@@ -132,18 +125,44 @@ impl RegionEncoder for RegionWords {
         Ok(all)
     }
 
+    fn add_surfaces(&mut self, features: &mut [f32], surfaces: &[Surface]) -> Result<()> {
+        let dim = self.dim();
+        if dim < DIM {
+            return Ok(());
+        }
+        let names = &self.vocabulary(&Silent)?.names[CLASSES * text::DIM..];
+        for (row, surface) in features.chunks_exact_mut(dim).zip(surfaces) {
+            add_stuff(row, &stuff::probabilities(surface), names);
+        }
+        Ok(())
+    }
+
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
+        let dim = self.dim();
         let vocabulary = self.vocabulary(&Silent)?;
-        let mut all = vec![0f32; texts.len() * DIM];
-        for (row, text) in all.chunks_exact_mut(DIM).zip(texts) {
+        let mut all = vec![0f32; texts.len() * dim];
+        for (row, text) in all.chunks_exact_mut(dim).zip(texts) {
             let meaning = vocabulary.encoder.embed(text)?;
             vocabulary.fill_phrase(row, text, meaning);
         }
         Ok(all)
     }
 
+    /// On the polygons of four tuning sets, 25 of 39 rightly located texts and 1 of 44 absent ones
+    /// are at 0.03 or below, and 4 and 23 at 0.3 or above.
+    fn presence_levels(&self) -> PresenceLevels {
+        PresenceLevels { found: 0.03, absent: 0.3 }
+    }
+
+    /// Only things that the vocabulary has: those that it has not fit nothing, and every text would
+    /// fit better. No surfaces: most scenes have walls and floors.
     fn embed_other_things(&mut self, form: &str) -> Result<Vec<f32>> {
-        let texts = things::of_form(form);
+        let dim = self.dim();
+        let mut texts = things::of_form(form);
+        texts.retain(|text| {
+            let noun = lexicon::noun(&colour::without(text));
+            noun.is_some_and(|noun| noun.classes.iter().all(|class| *class < CLASSES))
+        });
         let registry = self.registry.clone();
         let key = text_key("other-things", &registry).text(&texts.join("\n"));
         let vocabulary = self.vocabulary(&Silent)?;
@@ -154,61 +173,53 @@ impl RegionEncoder for RegionWords {
             true => registry.compute().remember(key, embed)?,
             false => embed()?,
         };
-        let mut all = vec![0f32; texts.len() * DIM];
+        let mut all = vec![0f32; texts.len() * dim];
         let fixed = &*vocabulary;
-        all.par_chunks_exact_mut(DIM)
+        all.par_chunks_exact_mut(dim)
             .zip(meanings.par_chunks_exact(text::DIM))
             .zip(&texts)
             .for_each(|((row, meaning), text)| fixed.fill_phrase(row, text, meaning.to_vec()));
         Ok(all)
     }
 
-    fn find_nearest_word(&mut self, text: &str) -> Result<Option<(bool, String)>> {
+    fn look_up(&mut self, text: &str) -> Result<Option<KnownWord>> {
         let vocabulary = self.vocabulary(&Silent)?;
         let meaning = vocabulary.encoder.embed(&colour::without(text))?;
-        Ok(vocabulary.nearest_word(meaning))
+        Ok(Some(vocabulary.look_up(text, meaning)?))
     }
 
     /// A text without a colour is embedded once for both.
-    fn embed_with_nearest_word(&mut self, text: &str) -> Result<(Vec<f32>, Option<(bool, String)>)> {
+    fn embed_and_look_up(&mut self, text: &str) -> Result<(Vec<f32>, Option<KnownWord>)> {
+        let mut row = vec![0f32; self.dim()];
         let vocabulary = self.vocabulary(&Silent)?;
         let meaning = vocabulary.encoder.embed(text)?;
-        let mut row = vec![0f32; DIM];
         vocabulary.fill_phrase(&mut row, text, meaning.clone());
         let plain = colour::without(text);
         let meaning = if plain == text { meaning } else { vocabulary.encoder.embed(&plain)? };
-        Ok((row, vocabulary.nearest_word(meaning)))
+        Ok((row, Some(vocabulary.look_up(text, meaning)?)))
     }
 
-    /// Class names, behind the region's colour where that raises the cosine: "yellow lemon".
+    /// Names of probable classes and stuff, behind the region's colour where that raises the cosine:
+    /// "yellow lemon".
     fn name_regions(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
+        let dim = self.dim();
         let vocabulary = self.vocabulary(&Silent)?;
-        let found = nearest(regions, &vocabulary.rows(), DIM, best);
-        let regions = regions.chunks_exact(DIM);
-        Ok(found
-            .into_iter()
-            .zip(regions)
-            .map(|(list, region)| vocabulary.with_colour(list, region))
-            .collect())
+        let found = nearest(regions, &vocabulary.rows(dim), dim, best);
+        let name = |(mut list, region): (Vec<(usize, f32)>, &[f32])| {
+            list.retain(|(class, _)| probability(region, *class) >= NAMED);
+            vocabulary.with_colour(list, region)
+        };
+        Ok(found.into_iter().zip(regions.chunks_exact(dim)).map(name).collect())
     }
 }
 
-/// Writes a text's blocks of meaning and classes.
-fn fill_text(row: &mut [f32], meaning: &[f32], classes: &[f32]) {
-    let known: f32 = classes.iter().sum();
-    fill(row, MEANING_AT, SHARES[0] * known, meaning.iter().copied());
-    fill(row, CLASSES_AT, SHARES[1], classes.iter().map(|w| w.sqrt()));
-}
-
-/// Writes a unit block with `share` of the squared length.
-fn fill(row: &mut [f32], start: usize, share: f32, values: impl IntoIterator<Item = f32>) {
-    row[start..].iter_mut().zip(values).for_each(|(r, v)| *r = share.sqrt() * v);
-}
-
-/// Cache key of the text models.
-fn text_key(kind: &'static str, registry: &Registry) -> OutputKey {
-    let used = registry.status_of(&[PackFileKind::Text, PackFileKind::Tokenizer, PackFileKind::Classes]);
-    used.iter().fold(OutputKey::new(kind), |key, file| key.text(&file.sha256))
+/// Whether two texts name things of one kind: their nouns have a class in common.
+pub fn are_of_one_kind(a: &str, b: &str) -> bool {
+    let noun = |text: &str| lexicon::noun(&colour::without(text));
+    match (noun(a), noun(b)) {
+        (Some(a), Some(b)) => a.classes.iter().any(|class| b.classes.contains(class)),
+        _ => false,
+    }
 }
 
 /// Mean distribution over colour terms of each region's pixels; `None` for a region without pixels.
@@ -222,93 +233,6 @@ fn region_colours(image: &RgbImage, labels: &Image<i32>, count: usize) -> Vec<Op
         }
     }
     sums.into_iter().map(|(sum, n)| (n > 0).then(|| sum.map(|s| s / n as f32))).collect()
-}
-
-impl Vocabulary {
-    fn load(registry: &Registry, progress: &dyn Progress) -> Result<Self> {
-        let file = registry.path(PackFileKind::Classes)?;
-        let table = files::read_text(&file)?;
-        // The first of a class's names: "lemon"; the rest are synonyms and Latin.
-        let first = |line: &str| line.split(['\t', ',']).next().unwrap_or_default().to_string();
-        let list: Vec<String> = table.lines().map(first).collect();
-        if list.len() != CLASSES {
-            return Err(Error::missing_model(
-                file.display(),
-                format!("{}: {} classes, expected {CLASSES}", file.display(), list.len()),
-            ));
-        }
-        let mut encoder = TextEncoder::load(registry)?;
-        // Embedding a thousand names takes seconds, too long for a single query.
-        let key = text_key("class-names", registry);
-        let mut names = registry.compute().remember(key, || {
-            encoder.embed_list(&list.iter().map(String::as_str).collect::<Vec<_>>(), progress)
-        })?;
-        let mut mean = vec![0f32; text::DIM];
-        for name in names.chunks_exact(text::DIM) {
-            mean.iter_mut().zip(name).for_each(|(m, n)| *m += n / CLASSES as f32);
-        }
-        for name in names.chunks_exact_mut(text::DIM) {
-            name.iter_mut().zip(&mean).for_each(|(n, m)| *n -= m);
-            normalise(name);
-        }
-        Ok(Vocabulary { encoder, mean, names, list })
-    }
-
-    /// Names of classes (index, cosine), behind the region's colour where that raises the cosine.
-    fn with_colour(&self, list: Vec<(usize, f32)>, region: &[f32]) -> Vec<(String, f32)> {
-        let (term, cosine) = colour::nearest_term(&region[COLOUR_AT..REST_AT]);
-        let gain = SHARES[2].sqrt() * cosine;
-        let name = |(i, cosine): (usize, f32)| match self.list[i].as_str() {
-            name if gain > 0.0 && colour::terms_in(name).is_none() => {
-                (format!("{term} {name}"), cosine + gain)
-            }
-            name => (name.to_owned(), cosine),
-        };
-        list.into_iter().map(name).collect()
-    }
-
-    /// Whether a sentence embedding is in the vocabulary, and its nearest word.
-    fn nearest_word(&self, meaning: Vec<f32>) -> Option<(bool, String)> {
-        let nearest = nearest(&self.centred(meaning), &self.names, text::DIM, 1).concat();
-        nearest.first().map(|(class, cosine)| (*cosine >= KNOWN, self.list[*class].clone()))
-    }
-
-    /// Subtracts the mean of the class names from a sentence embedding and normalises it.
-    fn centred(&self, mut meaning: Vec<f32>) -> Vec<f32> {
-        meaning.iter_mut().zip(&self.mean).for_each(|(v, m)| *v -= m);
-        normalise(&mut meaning);
-        meaning
-    }
-
-    /// Writes the row of a text with its sentence embedding [384].
-    fn fill_phrase(&self, row: &mut [f32], text: &str, meaning: Vec<f32>) {
-        let meaning = self.centred(meaning);
-        fill_text(row, &meaning, &self.weights(&meaning));
-        if let Some(said) = colour::terms_in(text) {
-            fill(row, COLOUR_AT, SHARES[2], colour::direction(&said));
-        }
-        row[REST_AT] = (1.0 - row.iter().map(|v| v * v).sum::<f32>()).max(0.0).sqrt();
-    }
-
-    /// The weight [1000] on each class of a centred unit embedding; they sum to less than 1.
-    fn weights(&self, meaning: &[f32]) -> Vec<f32> {
-        let scores = cosines(meaning, &self.names);
-        let most = scores.iter().copied().fold(THRESHOLD, f32::max);
-        let power = |score: f32| ((score - most) / SOFTNESS).exp();
-        let total = scores.iter().map(|s| power(*s)).sum::<f32>() + power(THRESHOLD);
-        scores.iter().map(|s| power(*s) / total).collect()
-    }
-
-    /// The class names as texts, without colour: [1000, DIM], all but the last coordinate, which no
-    /// region has.
-    fn rows(&self) -> Vec<f32> {
-        let mut rows = vec![0f32; CLASSES * DIM];
-        rows.par_chunks_exact_mut(DIM).zip(self.names.par_chunks_exact(text::DIM)).for_each(|(row, name)| {
-            let classes = self.weights(name);
-            fill_text(row, name, &classes);
-        });
-        rows
-    }
 }
 
 #[cfg(test)]
@@ -366,10 +290,10 @@ mod tests {
     fn phrases_find_breakfast_regions() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
         let sure = ["lemon", "blue mug", "plate", "red soda can", "loaf of bread", "green book"];
-        // Measured 39 of 41 on the views that the shares were chosen on, 73 of 81 on views that
-        // they were not.
+        // Measured 37 of 41 on the views that the shares were chosen on, 70 of 81 on views that
+        // they were not. The others are table, wall and carpet, which have no surface here.
         let (first, all) = first_of(&mut words, "train", &sure);
-        assert!(first >= 37 && all == 41, "{first} of {all}");
+        assert!(first >= 36 && all == 41, "{first} of {all}");
         let (first, all) = first_of(&mut words, "test", &sure);
         assert!(first >= 69 && all == 81, "{first} of {all}");
     }
@@ -387,24 +311,57 @@ mod tests {
         balance|symmetry";
 
     #[test]
-    fn find_nearest_word_detects_unknown_words() {
+    fn look_up_detects_unknown_words() {
         let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
-        let mut nearest = |text: &str| words.find_nearest_word(text).unwrap().unwrap();
-        let known = NO_THINGS.split('|').filter(|text| nearest(text).0).count();
-        assert!(NO_THINGS.split('|').count() == 100 && known <= 5, "{known} of them are known");
-        let known = |w: &str| (true, w.to_owned());
-        for (text, expected) in [
-            ("vase", known("vase")),
-            ("blue mug", known("coffee mug")),
-            ("lemon", known("lemon")),
-            ("red soda can", known("milk can")),
-            ("green book", known("comic book")),
-            ("usb cable", (false, "computer keyboard".to_owned())),
-            // Not the bird "African grey".
-            ("grey photosynthesis", (false, "greenhouse".to_owned())),
+        let mut look_up = |text: &str| words.look_up(text).unwrap().unwrap();
+        let known: Vec<&str> = NO_THINGS.split('|').filter(|text| look_up(text).nearest.is_some()).collect();
+        assert!(NO_THINGS.split('|').count() == 100 && known.len() <= 5, "known: {known:?}");
+        for (text, nearest) in [
+            ("vase", Some("vase")),
+            ("blue mug", Some("coffee mug")),
+            ("two lemons", Some("lemon")),
+            ("box of cereal", Some("packet")),
+            ("wooden floor", Some("floor")),
+            ("tree trunk", None),
+            ("grey happiness", None),
         ] {
-            assert_eq!(nearest(text), expected, "{text}");
+            assert_eq!(
+                look_up(text),
+                KnownWord { nearest: nearest.map(str::to_owned), ..KnownWord::default() }
+            );
         }
+        for text in ["Apfel", "Baumstamm", "Tür", "escalier", "Stuhl", "Zitrone"] {
+            assert_eq!(look_up(text), KnownWord { nearest: None, not_english: vec![text.to_owned()] });
+        }
+    }
+
+    /// A wall is no bolo tie, whatever the classifier takes its texture for.
+    #[test]
+    fn surfaces_take_share_of_classes() {
+        let mut words = RegionWords::load(Registry::open(None).unwrap()).unwrap();
+        let view = &views("train")[1];
+        let before = words.embed_regions(&view.image, &view.masks, 12, &Silent).unwrap();
+        let wall = Surface { share: 0.3, known: 1.0, flat: 0.98, ..Surface::default() };
+        let mut rows = before.clone();
+        words.add_surfaces(&mut rows, &[wall; 12]).unwrap();
+        let texts = words.embed_texts(&["wall", "floor", "lemon"]).unwrap();
+        let shown = |row: &&[f32]| row.iter().any(|v| *v != 0.0);
+        let all = rows.chunks_exact(DIM).zip(before.chunks_exact(DIM)).filter(|(row, _)| shown(row));
+        for (row, before) in all {
+            let fit = |row: &[f32]| [0, 1, 2].map(|t| dot(row, &texts[t * DIM..(t + 1) * DIM]));
+            let (own, earlier) = (fit(row), fit(before));
+            assert!(own[0] > 0.6 && own[0] > own[1] + 0.4 && earlier[0] < 0.2, "{own:?}, before {earlier:?}");
+            assert!(own[2] < 0.3, "{own:?}");
+            assert!((dot(row, row) - 1.0).abs() < 1e-4, "{}", dot(row, row));
+        }
+        // Scenes of the first revision have no such block.
+        assert!(words.use_space("words-1") && words.dim() == DIM - stuff::COUNT && !words.use_space("clip"));
+        let mut old = words.embed_regions(&view.image, &view.masks, 12, &Silent).unwrap();
+        let unchanged = old.clone();
+        words.add_surfaces(&mut old, &[wall; 12]).unwrap();
+        assert_eq!(old, unchanged);
+        let lemon = words.embed_texts(&["lemon"]).unwrap();
+        assert!(lemon.len() == words.dim() && (dot(&lemon, &lemon) - 1.0).abs() < 1e-4);
     }
 
     #[test]
@@ -413,7 +370,9 @@ mod tests {
         let view = &views("train")[1];
         let regions = words.embed_regions(&view.image, &view.masks, 12, &Silent).unwrap();
         let names = words.name_regions(&regions, 5).unwrap();
-        assert!(names.len() == 12 && names.iter().all(|list| list.len() == 5));
+        assert!(names.len() == 12 && names.iter().all(|list| list.len() <= 5));
+        // What may be anything has no name.
+        assert!(names.iter().filter(|list| list.is_empty()).count() >= 3, "{names:?}");
         let object = phrases().into_iter().find(|(_, p)| p == "lemon").map_or(0, |(o, _)| o as usize);
         // The classifier gives "spaghetti squash" as much.
         let found = names[object].iter().find(|(name, _)| name == "yellow lemon");
