@@ -1,11 +1,13 @@
 //! The laboratory of splatvk: the tables of the paper's experiments ([`ablate`]), data with ground
-//! truth ([`generate`]), figures against seconds of training ([`curve`]), the published evaluation protocols ([`protocol`]), and their commands
-//! ([`cli`], program `splatlab`). It is not part of the installed program.
+//! truth ([`generate`]), the alignment alone ([`alignment`]), figures against seconds of training
+//! ([`curve`]), evaluation protocols ([`protocol`]), and their commands ([`cli`], program
+//! `splatlab`). It is not part of the installed program.
 #![warn(missing_docs)]
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]
 
 pub mod ablate;
+pub mod alignment;
 pub mod cli;
 pub mod curve;
 pub mod generate;

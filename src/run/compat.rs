@@ -57,6 +57,7 @@ pub const PAPER: Compat = Compat {
         containment: 0.0,
         fusion_cover: 0.0,
         background_share: 1.0,
+        votes: false,
         veto: -1.0,
         ..AlignOptions::DEFAULT
     },

@@ -210,3 +210,37 @@ pub(super) fn pooled_feature(
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::LevelMasks;
+
+    /// One mask per view, with these features of two numbers, that form one component.
+    fn component(features: &[[f32; 2]]) -> (Alignment, Component) {
+        let view = |f: &[f32; 2]| {
+            let level = LevelMasks { quality: vec![1.0], features: f.to_vec(), ..LevelMasks::default() };
+            ViewMasks { levels: vec![level] }
+        };
+        let members: Vec<MaskId> = (0..features.len()).map(|v| MaskId::new(v, 0)).collect();
+        let component = Component { medoid: members[0], members, weight: 1.0 };
+        (Alignment { views: features.iter().map(view).collect(), ..Alignment::default() }, component)
+    }
+
+    #[test]
+    fn agreement_of_views_makes_features_long() {
+        let pooled = |features: &[[f32; 2]], pooling| {
+            let (alignment, component) = component(features);
+            pooled_feature(&alignment, 0, &component, pooling)
+        };
+        let (a, b) = ([1.0, 0.0], [0.0, 1.0]);
+        assert_eq!(pooled(&[a, b], Pooling::Medoid), a);
+        let length = |features: &[[f32; 2]]| {
+            let pooled = pooled(features, Pooling::Agreement);
+            pooled.iter().map(|v| v * v).sum::<f32>().sqrt()
+        };
+        let (alone, agreed, split) = (length(&[a]), length(&[a; 4]), length(&[a, b, a, b]));
+        assert!((alone - 1.0 / 1.5).abs() < 1e-6 && (agreed - 4.0 / 4.5).abs() < 1e-6, "{alone} {agreed}");
+        assert!(split < 0.71 * agreed, "{split}");
+    }
+}

@@ -30,6 +30,8 @@ pub enum Command {
     Ablate(AblateArgs),
     /// Data with ground truth → quality of a training against its seconds
     Curve(CurveArgs),
+    /// Generated scenes → which step of the alignment mends which error, without splats
+    Alignment(AlignmentArgs),
     /// Synthetic scene with ground truth, as hard as asked
     Generate(GenerateArgs),
     /// Scene against the labels of LERF-OVS, 3D-OVS or ScanNet → figures of their protocols
@@ -85,6 +87,20 @@ pub struct EvalArgs {
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
+}
+
+/// `splatlab alignment`
+#[derive(Debug, Args)]
+pub struct AlignmentArgs {
+    /// Number of scenes
+    #[arg(long, default_value_t = 200)]
+    pub scenes: u64,
+    /// Seed of the first one
+    #[arg(long, default_value_t = 2000)]
+    pub first: u64,
+    /// Report as one line of JSON, with the figures of every scene
+    #[arg(long)]
+    pub json: bool,
 }
 
 /// `splatlab ask`

@@ -39,6 +39,7 @@ fn flaws(args: &GenerateArgs) -> Result<InjectedErrors> {
         merge: args.merge,
         wrong: args.wrong,
         noise: args.noise,
+        alike: false,
     })
 }
 

@@ -1,6 +1,7 @@
 //! Command line of the laboratory: one file per command; parsing, reports and exit codes are those
 //! of `splatvk`.
 mod ablate;
+mod alignment;
 pub mod args;
 mod ask;
 mod curve;
@@ -21,7 +22,8 @@ pub fn main() -> ExitCode {
 impl Program for Lab {
     const NAME: &'static str = "splatlab";
 
-    const UNUSED: &'static [(&'static str, &'static [&'static str])] = &[("generate", &["provider", "log"])];
+    const UNUSED: &'static [(&'static str, &'static [&'static str])] =
+        &[("generate", &["provider", "log"]), ("alignment", &["provider"])];
 
     fn log(&self) -> LogFormat {
         self.global.log
@@ -37,6 +39,7 @@ impl Program for Lab {
                 args.device.provider = self.global.provider;
                 curve::curve(&args)
             }
+            Command::Alignment(args) => alignment::alignment(&args),
             Command::Generate(args) => generate::generate(&args),
             Command::Eval(mut args) => {
                 args.device.provider = self.global.provider;

@@ -16,7 +16,7 @@ pub use flat::Flat;
 pub use folder::{foreign, generate, write_regions};
 pub use outdoor::Sky;
 pub use phone::{Effects, PhotoEffects, TrueLight, to_linear, to_srgb};
-pub use render::{RayCast, photo, render};
+pub use render::{RayCast, geometry, photo, render};
 pub use scene::{SceneSpec, SyntheticScene, build_scene};
 pub use shapes::{Hit, Paint, SceneObject, Shape};
 pub use spoil::Spoil;

@@ -11,7 +11,7 @@ use splatvk::math::Random;
 use splatvk::photo::stem;
 use splatvk::query::presence::Alternatives;
 use splatvk::query::{CANONICAL_PHRASES, TextQuery};
-use splatvk::scene::Image;
+use splatvk::scene::{Camera, Image};
 use splatvk_test_support::embedding::{DIM, PHRASE_SHARE, region_feature, text_embedding};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -29,17 +29,20 @@ pub struct InjectedErrors {
     pub wrong: f64,
     /// Length of the random part of every feature, next to a common part of length 1.
     pub noise: f64,
+    /// Whether all views and levels have the same errors, as of one segmenter and encoder that see
+    /// the same thing.
+    pub alike: bool,
 }
 
 impl InjectedErrors {
     /// Exact masks and features.
     pub const NONE: InjectedErrors =
-        InjectedErrors { seed: 0, split: 0.0, merge: 0.0, wrong: 0.0, noise: 0.0 };
+        InjectedErrors { seed: 0, split: 0.0, merge: 0.0, wrong: 0.0, noise: 0.0, alike: false };
 
     /// Rates that `ablate` injects: every fifth mask is cut and every fifth feature wrong, about as
     /// often as for SAM and CLIP between distant views in the paper's figures.
     pub fn default_rates(seed: u64) -> InjectedErrors {
-        InjectedErrors { seed, split: 0.2, merge: 0.05, wrong: 0.2, noise: 0.35 }
+        InjectedErrors { seed, split: 0.2, merge: 0.05, wrong: 0.2, noise: 0.35, alike: false }
     }
 }
 
@@ -50,6 +53,19 @@ pub struct Regions {
     pub masks: Vec<ViewMasks>,
     /// Object index → exact feature of the whole object.
     pub embeddings: BTreeMap<u32, Vec<f32>>,
+}
+
+/// What photos show: per photo label and depth of every pixel. Parts of objects need depth; without
+/// it every object is one part.
+pub struct Shown<'a> {
+    /// Label → phrase.
+    pub labels: &'a BTreeMap<u32, String>,
+    /// Camera of each photo.
+    pub cameras: &'a [Camera],
+    /// Labels per photo.
+    pub objects: &'a [Image<u32>],
+    /// Depth per photo, 0 = unknown.
+    pub depths: &'a [Option<Image<f32>>],
 }
 
 /// A query in this space; its alternatives are the same thing in other colours, as of any encoder.
@@ -77,48 +93,68 @@ pub fn regions(truth: &GroundTruth, frames: &[&TruthFrame], flaws: &InjectedErro
             ))
         })?);
     }
-    let parts = parts(truth, frames, &objects)?;
-    let mut random = Random::new(flaws.seed ^ 0x7265_6769);
-    let names: Vec<&str> = truth.labels.values().map(String::as_str).collect();
-    let mut masks = Vec::new();
-    for (objects, parts) in objects.iter().zip(&parts) {
-        let mut view = ViewMasks::default();
-        for level in 0..3 {
-            view.levels.push(level_masks(&truth.labels, &names, objects, parts, level, flaws, &mut random));
-        }
-        masks.push(view);
-    }
-    let embeddings = truth
-        .labels
-        .iter()
-        .map(|(&k, phrase)| (k, region_feature(phrase, PHRASE_SHARE, &[], 0.0, &mut Random::new(0))));
-    Ok(Regions { masks, embeddings: embeddings.collect() })
+    let depths = frames.iter().map(|frame| truth.depth(frame)).collect::<Result<Vec<_>>>()?;
+    let cameras: Vec<Camera> = frames.iter().map(|frame| frame.camera.clone()).collect();
+    let shown = Shown { labels: &truth.labels, cameras: &cameras, objects: &objects, depths: &depths };
+    Ok(shown.regions(flaws))
 }
 
-/// Quarter of its object, 0 to 3, for every pixel of every frame. The signs along the object's two
-/// longest axes in space define it, so that all views agree.
-fn parts(truth: &GroundTruth, frames: &[&TruthFrame], objects: &[Image<u32>]) -> Result<Vec<Vec<u8>>> {
-    let mut points: BTreeMap<u32, Vec<DVec3>> = BTreeMap::new();
-    let mut positions = Vec::new();
-    for (frame, objects) in frames.iter().zip(objects) {
-        let depth = truth.depth(frame)?;
-        let unproject = |p: usize| {
-            let z = depth.as_ref().map_or(0.0, |d| d.data[p]);
-            let pixel = DVec2::new((p % objects.width) as f64 + 0.5, (p / objects.width) as f64 + 0.5);
-            (z > 0.0).then(|| frame.camera.unproject(pixel, f64::from(z)))
-        };
-        let view: Vec<Option<DVec3>> = (0..objects.data.len()).map(unproject).collect();
-        for (x, &label) in view.iter().zip(&objects.data) {
-            points.entry(label).or_default().extend(x);
+impl Shown<'_> {
+    /// Makes regions with injected errors.
+    pub fn regions(&self, flaws: &InjectedErrors) -> Regions {
+        let mut random = Random::new(flaws.seed ^ 0x7265_6769);
+        let names: Vec<&str> = self.labels.values().map(String::as_str).collect();
+        let mut masks = Vec::new();
+        for (objects, parts) in self.objects.iter().zip(&self.parts()) {
+            let mut view = ViewMasks::default();
+            for level in 0..3 {
+                let made = level_masks(self.labels, &names, objects, parts, level, flaws, &mut random);
+                view.levels.push(made);
+            }
+            masks.push(view);
         }
-        positions.push(view);
+        let exact = |phrase: &String| region_feature(phrase, PHRASE_SHARE, &[], 0.0, &mut Random::new(0));
+        Regions { masks, embeddings: self.labels.iter().map(|(&k, phrase)| (k, exact(phrase))).collect() }
     }
-    let axes: BTreeMap<u32, (DVec3, [DVec3; 2])> =
-        points.into_iter().filter_map(|(label, points)| Some((label, principal(&points)?))).collect();
-    let view_quarters = |(positions, objects): (&Vec<Option<DVec3>>, &Image<u32>)| {
-        positions.iter().zip(&objects.data).map(|(x, label)| quarter(*x, axes.get(label))).collect()
-    };
-    Ok(positions.iter().zip(objects).map(view_quarters).collect())
+
+    /// Per level and photo the number of the object's part that a pixel shows; parts of different
+    /// objects have different numbers.
+    pub fn part_numbers(&self) -> [Vec<Image<u32>>; 3] {
+        let parts = self.parts();
+        [4, 2, 1].map(|kinds| {
+            let numbers = self.objects.iter().zip(&parts).map(|(objects, parts)| {
+                let number = |(label, part): (&u32, &u8)| 4 * label + u32::from(*part) % kinds;
+                let data = objects.data.iter().zip(parts).map(number).collect();
+                Image { width: objects.width, height: objects.height, data }
+            });
+            numbers.collect()
+        })
+    }
+
+    /// Quarter of its object, 0 to 3, for every pixel of every photo. The signs along the object's
+    /// two longest axes in space define it, so that all views agree.
+    fn parts(&self) -> Vec<Vec<u8>> {
+        let mut points: BTreeMap<u32, Vec<DVec3>> = BTreeMap::new();
+        let mut positions = Vec::new();
+        for ((camera, depth), objects) in self.cameras.iter().zip(self.depths).zip(self.objects) {
+            let unproject = |p: usize| {
+                let z = depth.as_ref().map_or(0.0, |d| d.data[p]);
+                let pixel = DVec2::new((p % objects.width) as f64 + 0.5, (p / objects.width) as f64 + 0.5);
+                (z > 0.0).then(|| camera.unproject(pixel, f64::from(z)))
+            };
+            let view: Vec<Option<DVec3>> = (0..objects.data.len()).map(unproject).collect();
+            for (x, &label) in view.iter().zip(&objects.data) {
+                points.entry(label).or_default().extend(x);
+            }
+            positions.push(view);
+        }
+        let axes: BTreeMap<u32, (DVec3, [DVec3; 2])> =
+            points.into_iter().filter_map(|(label, points)| Some((label, principal(&points)?))).collect();
+        let view_quarters = |(positions, objects): (&Vec<Option<DVec3>>, &Image<u32>)| {
+            positions.iter().zip(&objects.data).map(|(x, label)| quarter(*x, axes.get(label))).collect()
+        };
+        positions.iter().zip(self.objects).map(view_quarters).collect()
+    }
 }
 
 /// Quarter of an object, 0 to 3, in which a point lies; 0 where either is unknown.
@@ -165,12 +201,15 @@ fn level_masks(
 ) -> LevelMasks {
     let mut out =
         LevelMasks { labels: Image::filled(objects.width, objects.height, -1), ..LevelMasks::default() };
-    let swallowed = swallowed(labels, objects, level, flaws, random);
+    // Errors that are alike are drawn anew for every view and level, from one seed.
+    let mut own = Random::new(flaws.seed ^ 0x616c_696b);
+    let swallowed = swallowed(labels, objects, level, flaws, if flaws.alike { &mut own } else { random });
     for (&label, phrase) in labels {
         let pixels: Vec<usize> = (0..objects.data.len()).filter(|&p| objects.data[p] == label).collect();
         // Drawn also for hidden objects: visibility in one view must not change errors in others.
-        let (cut, mistaken) = (random.uniform() < flaws.split, random.uniform() < flaws.wrong);
-        let other = names[random.below(names.len())];
+        let errors = if flaws.alike { &mut own } else { &mut *random };
+        let (cut, mistaken) = (errors.uniform() < flaws.split, errors.uniform() < flaws.wrong);
+        let other = names[errors.below(names.len())];
         let background = BACKGROUND_LABELS.contains(&phrase.as_str());
         let shown = if mistaken && !background { other } else { phrase.as_str() };
         let kinds = if background || level == 2 { 1 } else { [4, 2][level] };

@@ -77,6 +77,12 @@ fn picture(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, noise: 
 /// Renders a view without effects of its camera; `noise` is the standard deviation of its noise,
 /// share of full white.
 pub fn render(scene: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) -> RayCast {
+    let (depth, objects) = geometry(scene, camera);
+    RayCast { image: picture(scene, camera, None, noise, seed), depth, objects }
+}
+
+/// Depth and label per pixel of a view, without its picture.
+pub fn geometry(scene: &SyntheticScene, camera: &Camera) -> (Image<f32>, Image<u32>) {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let to_world = camera.pose.inverse();
     let sky_label = scene.sky.as_ref().map_or(0, |sky| sky.label);
@@ -87,11 +93,8 @@ pub fn render(scene: &SyntheticScene, camera: &Camera, noise: f64, seed: u64) ->
         hit.map_or((0.0, sky_label), |(t, h)| (h.t as f32, t.label))
     };
     let pixels: Vec<(f32, u32)> = (0..width * height).into_par_iter().map(depth_and_label).collect();
-    RayCast {
-        image: picture(scene, camera, None, noise, seed),
-        depth: Image { width, height, data: pixels.iter().map(|p| p.0).collect() },
-        objects: Image { width, height, data: pixels.iter().map(|p| p.1).collect() },
-    }
+    let depth = Image { width, height, data: pixels.iter().map(|p| p.0).collect() };
+    (depth, Image { width, height, data: pixels.iter().map(|p| p.1).collect() })
 }
 
 /// Renders a photo with the effects of its camera; depth and mask are those of the undistorted

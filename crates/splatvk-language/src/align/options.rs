@@ -36,6 +36,8 @@ pub struct AlignOptions {
     pub containment: f64,
     /// Share of the fusion target that the masks to be fused must cover together.
     pub fusion_cover: f64,
+    /// Whether the other views vote on a fusion.
+    pub votes: bool,
     /// Masks above this share of the image are background and never a fusion target.
     pub background_share: f64,
     /// Run step 1 (dense matches).
@@ -65,6 +67,7 @@ impl AlignOptions {
         veto: 0.5,
         containment: 0.6,
         fusion_cover: 0.5,
+        votes: true,
         background_share: 0.6,
         matching: true,
         fusion: true,

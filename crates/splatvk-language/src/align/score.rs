@@ -281,13 +281,31 @@ fn fusion_sets(state: &LevelState, pairs: &[PairLinks], options: &AlignOptions) 
             };
             let coverage = members.iter().map(|&a| back.at(b, a) as f64).sum::<f64>() / size;
             // with little coverage the members may be only a part of the target
-            if coverage >= options.fusion_cover && members.iter().all(contained) && members.iter().all(alike)
-            {
+            let whole = coverage >= options.fusion_cover && members.iter().all(contained);
+            let agreed = || !options.votes || is_voted(&table, i, &members, j, state.labels.len());
+            if whole && members.iter().all(alike) && agreed() {
                 sets.push(FusionSet { view: i, members, target, coverage });
             }
         }
     }
     sets
+}
+
+/// Whether at least as many views show masks of view `i` as one mask as show them as several; `j`
+/// shows them as one. A
+/// view that matches fewer than two of them has no vote.
+fn is_voted(table: &Table, i: usize, members: &[usize], j: usize, views: usize) -> bool {
+    let (mut one, mut several) = (1, 0);
+    for k in (0..views).filter(|k| *k != i && *k != j) {
+        let partners: Vec<MaskId> =
+            members.iter().filter_map(|a| Some(table.get(&(i as u32, *a as u32, k as u32))?.to)).collect();
+        match partners.iter().all(|to| *to == partners[0]) {
+            _ if partners.len() < 2 => {}
+            true => one += 1,
+            false => several += 1,
+        }
+    }
+    one >= several
 }
 
 /// Step 3 (docs/internals/method.md#reprojection): mutual best partners through depth and poses;

@@ -381,6 +381,34 @@ fn fuse_takes_feature_of_stronger_set() {
     }
 }
 
+/// One view whose mask swallows a neighbour must not fuse the two masks of all other views.
+#[test]
+fn fuse_follows_most_views() {
+    let (width, height) = (120, 10);
+    let view = |pieces: i32| {
+        // Without pieces the view shows nothing.
+        let label = |x: usize| if x < 40 && pieces > 0 { x as i32 / (40 / pieces) } else { -1 };
+        let data = (0..width * height).map(|p| label(p % width));
+        let level = LevelMasks {
+            labels: Image { width, height, data: data.collect() },
+            quality: vec![1.0; pieces as usize],
+            features: [1.0, 0.0, 0.0].repeat(pieces as usize),
+            ..LevelMasks::default()
+        };
+        ViewMasks { levels: vec![level] }
+    };
+    let pairs: Vec<PairLinks> =
+        (1..4).map(|k| links_from_overlay(0, k, &vec![true; width * height])).collect();
+    for (others, votes, fused) in
+        [([1, 2, 2], true, 0), ([1, 2, 2], false, 1), ([1, 1, 2], true, 1), ([1, 2, 0], true, 1)]
+    {
+        let views: Vec<ViewMasks> = [2].into_iter().chain(others).map(view).collect();
+        let mut state = LevelState::new(&views, 0);
+        let options = AlignOptions { votes, ..AlignOptions::default() };
+        assert_eq!(fuse(&mut state, &pairs, &options).len(), fused, "{others:?} {votes}");
+    }
+}
+
 #[test]
 fn same_place_score_fails_under_motion() {
     // One thing of ten pixels' width, moved to the right by `shift` pixels in view 1.
