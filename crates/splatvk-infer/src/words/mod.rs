@@ -1,6 +1,7 @@
 //! `words`: image regions and phrases in one space, from a classifier and a sentence encoder.
 //!
-//! A region's embedding is three blocks, each of fixed share of the squared length:
+//! An embedding has four blocks; meaning, colour, and classes with stuff have fixed shares of the
+//! squared length:
 //!
 //! | block | region | text |
 //! |---|---|---|
