@@ -119,6 +119,51 @@ fn sam2_passes_fine_features() {
     assert!(error.contains("point_") && error.contains("Expected: 1"), "{error}");
 }
 
+/// The interface of onnx-community's SAM 2.1: three feature maps, points in batches, and boxes, of
+/// which there are none.
+#[test]
+fn sam2_reads_hugging_face_layout() {
+    let dir = tempfile::tempdir().unwrap();
+    Onnx::new()
+        .input("pixel_values", FLOAT, "batch 3 64 64")
+        .output("image_embeddings.0", "batch 3 16 16")
+        .output("image_embeddings.1", "batch 3 8 8")
+        .output("image_embeddings.2", "batch 3 4 4")
+        .weight("seven", &[1], &[7.0])
+        .node(AVERAGE, "pixel_values", "fine", &pool(4))
+        .node("Add", "fine seven", "image_embeddings.0", &[])
+        .node(AVERAGE, "pixel_values", "image_embeddings.1", &pool(8))
+        .node(AVERAGE, "pixel_values", "image_embeddings.2", &pool(16))
+        .write(&dir.path().join("sam2_hf/vision_encoder.onnx"));
+    let decoder = Onnx::new()
+        .input("input_points", FLOAT, "batch prompts points 2")
+        .input("input_labels", INT64, "batch prompts points")
+        .input("input_boxes", FLOAT, "batch boxes 4")
+        .input("image_embeddings.0", FLOAT, "batch 3 16 16")
+        .input("image_embeddings.1", FLOAT, "batch 3 8 8")
+        .input("image_embeddings.2", FLOAT, "batch 3 4 4")
+        .output("iou_scores", "batch prompts 3")
+        .output("pred_masks", "batch prompts 3 8 8")
+        .integers("one", &[1, 1, 1, 1, 1])
+        .integers("first", &[0])
+        .integers("second", &[1])
+        .integers("points", &[2])
+        // Behind each point is a padding point.
+        .node("Slice", "input_points first second points", "prompts", &[])
+        // The sum over no boxes is zero.
+        .node("ReduceSum", "input_boxes", "boxes", &[("keepdims", Attribute::Int(0))])
+        .node("ReduceMean", "image_embeddings.0", "mean", &[("keepdims", Attribute::Int(0))])
+        .node("Add", "mean boxes", "also", &[])
+        .node("Reshape", "also one", "position", &[]);
+    let decoder = with_masks(decoder, "prompts", 3, &[1, 1, 3, 8, 8], "position", "pred_masks");
+    with_scores(decoder, &[1, 1, 3], &[1, -1, 1], &[0.2, 0.3, 0.4], "iou_scores")
+        .write(&dir.path().join("sam2_hf/prompt_encoder_mask_decoder.onnx"));
+    let (logits, scores) = decode_prompts(dir.path(), "sam2");
+    // Columns 8 and 24 of 32 are 16 and 48 of 64.
+    assert_near(&logits, &[23.0, 123.0, 223.0, 55.0, 155.0, 255.0]);
+    assert_near(&scores, &[0.2, 0.3, 0.4, 0.2, 0.3, 0.4]);
+}
+
 #[test]
 fn sam_reads_hugging_face_layout() {
     let dir = tempfile::tempdir().unwrap();

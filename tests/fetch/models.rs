@@ -34,28 +34,39 @@ fn depth_network(padding: usize) -> Vec<u8> {
 
 /// Towers for three colours: image, text and tokenizer.
 pub fn clip_graphs() -> (Onnx, Onnx, String) {
-    // Images are normalised by CLIP's mean and deviation; the offset makes black zero again.
+    // Images are normalised by CLIP's mean and deviation.
+    towers(["image", "text"], "embedding", [1.79, 1.75, 1.48])
+}
+
+/// Towers with the interface of SigLIP.
+pub fn siglip_graphs() -> (Onnx, Onnx, String) {
+    towers(["pixel_values", "input_ids"], "pooler_output", [1.0; 3])
+}
+
+/// Towers of colours with these names of inputs and of the output; adding `black` to a normalised
+/// black image gives zero.
+fn towers([image, text]: [&str; 2], embedding: &str, black: [f32; 3]) -> (Onnx, Onnx, String) {
     let image = Onnx::new()
-        .input("image", FLOAT, "batch 3 16 16")
-        .output("embedding", "batch 3")
-        .weight("black", &[3], &[1.79, 1.75, 1.48])
+        .input(image, FLOAT, "batch 3 16 16")
+        .output(embedding, "batch 3")
+        .weight("black", &[3], &black)
         .node(
             "ReduceMean",
-            "image",
+            image,
             "mean",
             &[("axes", Attribute::Ints(&[2, 3])), ("keepdims", Attribute::Int(0))],
         )
-        .node("Add", "mean black", "embedding", &[]);
+        .node("Add", "mean black", embedding, &[]);
     let words = ["[UNK]", "red", "green", "blue"];
     let mut table = vec![0.01f32; 3 * words.len()];
     (0..3).for_each(|k| table[3 * (k + 1) + k] = 100.0);
     let text = Onnx::new()
-        .input("text", INT64, "1 8")
-        .output("embedding", "1 3")
+        .input(text, INT64, "1 8")
+        .output(embedding, "1 3")
         .weight("table", &[words.len() as u64, 3], &table)
         .integers("axis", &[1])
-        .node("Gather", "table text", "rows", &[])
-        .node("ReduceSum", "rows axis", "embedding", &[("keepdims", Attribute::Int(0))]);
+        .node("Gather", &format!("table {text}"), "rows", &[])
+        .node("ReduceSum", "rows axis", embedding, &[("keepdims", Attribute::Int(0))]);
     let vocabulary: Vec<String> = words.iter().enumerate().map(|(i, w)| format!("\"{w}\": {i}")).collect();
     let tokenizer = format!(
         r#"{{"version": "1.0", "truncation": null, "padding": null, "added_tokens": [], "normalizer": {{"type": "Lowercase"}},

@@ -13,13 +13,14 @@ use super::runtime::Tensor;
 use crate::scene::MAX_SIDE;
 use crate::{Error, Result, files};
 
-const BUILT_IN: [(&str, &str); 14] = [
+const BUILT_IN: [(&str, &str); 15] = [
     ("clip", include_str!("adapters/clip.toml")),
     ("lseg", include_str!("adapters/lseg.toml")),
     ("siglip", include_str!("adapters/siglip.toml")),
     ("sam", include_str!("adapters/sam.toml")),
     ("sam-transformers", include_str!("adapters/sam-transformers.toml")),
     ("sam2", include_str!("adapters/sam2.toml")),
+    ("sam2-transformers", include_str!("adapters/sam2-transformers.toml")),
     ("dust3r", include_str!("adapters/dust3r.toml")),
     ("mast3r", include_str!("adapters/mast3r.toml")),
     ("vggt", include_str!("adapters/vggt.toml")),

@@ -138,6 +138,7 @@ static MASK_DECODER: Contract = Contract {
         maybe("position", "B Cp hp wp", &[]),
         slot("points", "P N 2", &["b P N 2"]),
         integer(slot("labels", "P N", &["b P N"])),
+        maybe("boxes", "b K 4", &[]),
         maybe("mask", "b 1 m n", &[]),
         maybe("has_mask", "q", &[]),
         maybe("size", "2", &[]),

@@ -109,6 +109,8 @@ impl Sam {
         let mut fed = vec![
             ("points", Input::F32(vec![rows, count, 2], coords)),
             ("labels", Input::I64(vec![rows, count], labels)),
+            // No boxes; the batch is one image.
+            ("boxes", Input::F32(vec![1, 0, 4], Vec::new())),
             ("mask", Input::F32(vec![mask_rows, 1, low[0], low[1]], vec![0.0; mask_rows * low[0] * low[1]])),
             ("has_mask", Input::F32(vec![1], vec![0.0])),
             // Only the low-resolution logits are used; the graph's own enlargement is kept small.

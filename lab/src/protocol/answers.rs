@@ -1,5 +1,5 @@
 //! Answers as a user gets them, against polygons on photographs: presence, place and mask
-//! (docs/internals/method.md#photographs).
+//! (docs/internals/data.md#polygons-on-photographs).
 use super::lerf::{self, Target};
 use super::score::mask_iou;
 use crate::{Error, Result};

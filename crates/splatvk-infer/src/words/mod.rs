@@ -12,7 +12,7 @@
 //!
 //! Classes and stuff share one posterior and one share of the squared length. The class block
 //! separates things: a dot product of square roots is a Bhattacharyya coefficient. A text means the
-//! classes that are of the kind of its noun ([`lexicon`]); one without a known noun means those with
+//! classes that are of the kind of its noun (`lexicon.rs`); one without a known noun means those with
 //! the nearest names, by a steep softmax. The meaning block ranks things that no class names.
 //! Sentence embeddings have the mean of the class names removed, which carries no information.
 //!
