@@ -172,7 +172,10 @@ fn dry_run_lists_addresses_and_files() {
         }
     }
     let mirrored = succeeds(&mut place.fetch(&["open", "--dry-run"], &server.address));
-    assert!(mirrored.contains(&format!("{}/Acly/MobileSAM/resolve/", server.address)), "{mirrored}");
+    assert!(
+        mirrored.contains(&format!("{}/onnx-community/sam2.1-hiera-small-ONNX/resolve/", server.address)),
+        "{mirrored}"
+    );
     assert!(!mirrored.contains("huggingface.co"), "{mirrored}");
     assert!(server.requests().is_empty() && !place.models().exists());
 }
