@@ -9,7 +9,8 @@ import collections, re, sys
 
 # Kinds of more classes say nothing about a picture ("artifact"), except these.
 MOST, WIDE = 70, {"animal", "dog"}
-# Nouns with the classes that show them in photographs, where WordNet has none, or others than a question about a photo means.
+# Nouns with the classes that show them in photographs, where WordNet has none, or others than a
+# question about a photo means.
 SHOWN_AS = """book: book jacket, comic book|shelf: bookcase|bookshelf: bookcase|cupboard: china cabinet, medicine chest, wardrobe|sink: washbasin|
 kettle: teapot, coffeepot|coffee machine: espresso maker|fridge: refrigerator|tv: television|soda can: pop bottle, milk can|
 cereal box: carton, packet|box: carton, crate, chest, pencil box|milk carton: carton|flowerpot: pot|plant pot: pot|garbage can: ashcan|rubbish bin: ashcan|mobile phone: cellular telephone|
@@ -64,7 +65,7 @@ def main():
         names, definition = line.rstrip("\n").split("\t")
         names = [n.strip().lower() for n in names.split(",")]
         said = set(re.findall("[a-z]+", definition.lower()))
-        # The synset with most of the class's names; of several, the one whose definition is the class's.
+        # The synset with most of the class's names; of several, the one with its definition.
         fit = lambda o: (sum(n in synsets[o][0] for n in names) / 10 + len(said & synsets[o][2]) / len(said | synsets[o][2]), o)
         todo, seen = [max({o for n in names for o in by_name[n]}, key=fit)], set()
         while todo:

@@ -55,7 +55,7 @@ pub struct Regions {
     pub embeddings: BTreeMap<u32, Vec<f32>>,
 }
 
-/// What photos show: per photo label and depth of every pixel. Parts of objects need depth; without
+/// Contents of photos: label and depth of every pixel. Parts of objects need depth; without
 /// it every object is one part.
 pub struct Shown<'a> {
     /// Label → phrase.

@@ -372,7 +372,7 @@ mod tests {
         let regions = words.embed_regions(&view.image, &view.masks, 12, &Silent).unwrap();
         let names = words.name_regions(&regions, 5).unwrap();
         assert!(names.len() == 12 && names.iter().all(|list| list.len() <= 5));
-        // What may be anything has no name.
+        // A region that may be anything has no name.
         assert!(names.iter().filter(|list| list.is_empty()).count() >= 3, "{names:?}");
         let object = phrases().into_iter().find(|(_, p)| p == "lemon").map_or(0, |(o, _)| o as usize);
         // The classifier gives "spaghetti squash" as much.
