@@ -237,7 +237,7 @@ fn scenes_of_a_batch_are_those_of_run() {
     }
     let options = r#""options": {"iterations": 30, "language_iterations": 4, "deterministic": true}"#;
     let rows = format!(
-        r#"{{"id": "table", "input": "table/*.png", {options}, "queries": ["lemon"], "exports": ["glb", "colmap", "t.spz"]}}
+        r#"{{"id": "table", "input": "table/*.png", {options}, "queries": ["lemon", "wall"], "exports": ["glb", "colmap", "t.spz"]}}
 {{"id": "lonely", "input": "lonely"}}
 {{"id": "odd", "input": "table", "options": {{"iteration": 3}}}}
 {{"id": "odder", "input": "table", "exports": ["obj"]}}"#
@@ -258,6 +258,11 @@ fn scenes_of_a_batch_are_those_of_run() {
     let success: Value =
         serde_json::from_slice(&std::fs::read(at("out/table/_SUCCESS.json")).unwrap()).unwrap();
     assert_eq!(success["answers"][0]["text"], "lemon");
+    // The wall is recognised by its shape; no class of the classifier is a wall.
+    assert_eq!(
+        (&success["answers"][1]["text"], &success["answers"][1]["presence"]),
+        (&"wall".into(), &"found".into())
+    );
     assert!(
         success["psnr"].as_f64().unwrap() > 10.0 && success["device"]["uuid"].as_str().unwrap().len() == 36
     );
@@ -267,7 +272,7 @@ fn scenes_of_a_batch_are_those_of_run() {
 
     let mut run = splatvk();
     run.arg("run").arg(at("table")).arg("--out").arg(at("own")).args(["--iterations", "30"]);
-    run.args(["--language-iterations", "4", "--deterministic", "--query", "lemon"]);
+    run.args(["--language-iterations", "4", "--deterministic", "--query", "lemon", "--query", "wall"]);
     assert!(run.output().unwrap().status.success());
     for file in ["point_cloud.ply", "language/features.npz", "cameras/transforms.json", "seen.npy"] {
         let read = |scene: &str| std::fs::read(at(scene).join(file)).unwrap();
