@@ -100,7 +100,11 @@ fn field(scored: &Scored, scope: &Scope) -> Figures {
     let masks = || report.masks.iter().filter(|m| in_scope(&m.frame));
     put(&mut out, "mIoU", mean(masks().map(|m| m.iou)));
     put(&mut out, "mAcc", mean(masks().map(|m| f64::from(m.localised))));
-    put(&mut out, "PSNR", mean(report.images.iter().filter(|i| in_scope(&i.frame)).map(|i| i.psnr)));
+    // The models of the levels, where they differ from that of the scene.
+    let models = if scored.models.is_empty() { std::slice::from_ref(report) } else { &scored.models };
+    let images = || models.iter().flat_map(|m| &m.images).filter(|i| in_scope(&i.frame));
+    put(&mut out, "PSNR", mean(images().map(|i| i.psnr)));
+    put(&mut out, "AbsRel", mean(images().filter_map(|i| i.depth_abs_rel)));
     let others = report.masks.iter().filter(|m| m.split != scope.headline);
     put(&mut out, scope.other(), mean(others.map(|m| m.iou)));
     out
@@ -132,6 +136,9 @@ fn published(report: &ProtocolReport, scope: &Scope) -> Figures {
 /// Figures of a row with a scene, by column.
 pub(super) fn figures(o: &RowFigures, scope: &Scope) -> Figures {
     let mut out = scores(&o.scored, scope);
+    put(&mut out, "needles", Some(o.shape.needles));
+    put(&mut out, "growth", o.shape.growth);
+    put(&mut out, "growth unseen", o.shape.growth_unseen);
     put(&mut out, "splats", Some(o.splats as f64));
     put(&mut out, "codes", Some(o.codes.iter().sum::<usize>() as f64));
     put(&mut out, "MB", Some(o.feature_bytes as f64 / 1e6));
@@ -160,6 +167,7 @@ pub(super) fn iou(scored: &Scored, scope: &Scope) -> Figures {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ablate::shape::Shape;
     use crate::ablate::stages::{EmbeddingAgreement, Scored};
     use splatvk::eval::{EvalReport, MaskScore};
 
@@ -190,7 +198,8 @@ mod tests {
         let agreement =
             EmbeddingAgreement { frame: "c".into(), split: Split::Test, similarity: 0.5, mse: 0.1 };
         let outcome = RowFigures {
-            scored: std::sync::Arc::new(Scored { report, agreement: vec![agreement], published: None }),
+            scored: std::sync::Arc::new(Scored { report, agreement: vec![agreement], ..Scored::default() }),
+            shape: Shape::default(),
             splats: 7,
             codes: vec![1, 2],
             feature_bytes: 5_000_000,

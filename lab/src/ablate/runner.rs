@@ -3,6 +3,7 @@
 use super::data::{DataSet, Layout, Scope};
 use super::flat;
 use super::setup::{Available, Network, Regions, RowWork, Setup, TableRow};
+use super::shape::Shape;
 use super::stages::{
     EncoderEmbeddings, LabelEmbeddings, LabelledMasks, MaskEmbeddings, ObjectEmbeddings, Score,
     ScorePublished, Scored, SyntheticEmbeddings, SyntheticMasks,
@@ -30,7 +31,7 @@ use splatvk::run::sources::{
     PosedPhotos, SourceChoice,
 };
 use splatvk::run::stages::{self, CameraOrigin, PlacedPhotos, SharedEncoder};
-use splatvk::scene::{Camera, LanguageField};
+use splatvk::scene::{Camera, LanguageField, Splats};
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -41,6 +42,8 @@ use std::sync::Arc;
 pub struct RowFigures {
     /// Scores, and agreement of decoded embeddings with the true ones.
     pub scored: Arc<Scored>,
+    /// Shape of the splats after the language stage.
+    pub shape: Shape,
     /// Number of splats of the finished scene.
     pub splats: usize,
     /// Number of codes per level.
@@ -391,14 +394,20 @@ impl<'a> Runner<'a> {
             return Ok(known.clone());
         }
         let s = self.stages(setup)?;
-        let targets = [s.placed.target(), s.aligned.target(), s.language.target(), s.scored.target()];
+        let ends = [s.placed.target(), s.geometry.target(), s.aligned.target(), s.trained.target()];
+        let targets = [&ends[..], &[s.language.target(), s.scored.target()]].concat();
         let progress = Recorded::new(self.progress);
         let made = s.build.graph.run(&targets, self.device, self.registry, &self.store, &progress)?;
         let (placed, language, scored) = (made.get(s.placed)?, made.get(s.language)?, made.get(s.scored)?);
         let levels = &language.field.levels;
         let codes = levels.iter().map(|l| l.codebook.members.iter().filter(|m| !m.is_empty()).count());
         let channels: usize = levels.iter().map(|l| l.codebook.code_dim).sum();
+        let (trained, geometry) = (made.get(s.trained)?, made.get(s.geometry)?);
+        let views: Vec<_> = trained.cameras.iter().zip(&geometry.depths).collect();
+        let own: Vec<&Splats> = levels.iter().filter_map(|l| l.splats.as_ref()).collect();
+        let models = if own.is_empty() { vec![&language.splats] } else { own };
         let figures = RowFigures {
+            shape: Shape::of(&trained.splats, &models, &views),
             splats: language.splats.len(),
             codes: codes.collect(),
             feature_bytes: feature_bytes(language.splats.len(), channels, pixels(&placed)),

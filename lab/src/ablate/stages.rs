@@ -15,7 +15,7 @@ use splatvk::query::{QueryOptions, TextQuery};
 use splatvk::run::score::{Questions, ScoredScene, score_field};
 use splatvk::run::stages::{PlacedPhotos, SharedEncoder};
 use splatvk::run::view::Viewer;
-use splatvk::scene::{Codebook, Image};
+use splatvk::scene::{Codebook, Image, LanguageField, Splats};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -45,6 +45,8 @@ pub struct Scored {
     pub published: Option<ProtocolReport>,
     /// Agreement of embeddings, per frame.
     pub agreement: Vec<EmbeddingAgreement>,
+    /// Images of the models of single levels, where levels have models of their own.
+    pub models: Vec<EvalReport>,
 }
 
 /// Ground-truth frame of each photo.
@@ -202,7 +204,7 @@ impl Stage for Score {
         let report = score_field(
             context.device,
             ScoredScene { splats: &language.splats, backdrop: &trained.backdrop, field: &language.field },
-            Questions { queries: &self.queries, options: self.options },
+            Questions { queries: &self.queries, options: self.options.clone() },
             evaluation,
             false,
             context.progress,
@@ -220,7 +222,20 @@ impl Stage for Score {
                 Ok(())
             },
         )?;
-        Ok(Scored { report, agreement: agreements, published: None })
+        let models = levels.iter().filter_map(|l| l.splats.as_ref());
+        let models = models.map(|splats| self.images(trained, splats, context)).collect::<Result<_>>()?;
+        Ok(Scored { report, agreement: agreements, published: None, models })
+    }
+}
+
+impl Score {
+    /// Scores the images of the model of one level.
+    fn images(&self, trained: &Trained, splats: &Splats, context: &Context) -> Result<EvalReport> {
+        let evaluation = Evaluation::new((*self.truth).clone(), &trained.cameras, None)?;
+        let (backdrop, field) = (&trained.backdrop, &LanguageField::default());
+        let scene = ScoredScene { splats, backdrop, field };
+        let none = Questions { queries: &[], options: QueryOptions::default() };
+        score_field(context.device, scene, none, evaluation, false, context.progress, &mut |_, _| Ok(()))
     }
 }
 
