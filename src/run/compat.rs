@@ -58,7 +58,7 @@ pub const PAPER: Compat = Compat {
         fusion_cover: 0.0,
         background_share: 1.0,
         votes: false,
-        veto: -1.0,
+        ranked: false,
         ..AlignOptions::DEFAULT
     },
     paint_in_order: false,

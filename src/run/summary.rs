@@ -153,7 +153,7 @@ fn closing_lines(o: &RunOutcome) -> Vec<(String, String)> {
     let device = std::iter::once(("device".to_owned(), format!("{}{which}", o.device.name)));
     let figures = figures(o).into_iter().map(|f| (f.label.to_owned(), f.value));
     let answers = o.language.iter().flat_map(|l| &l.answers);
-    let answers = answers.map(|a| (format!("“{}”", report::one_line(&a.text)), a.verdict()));
+    let answers = answers.map(|a| (format!("“{}”", report::one_line(&a.text)), a.sentence()));
     device.chain(figures).chain(answers).collect()
 }
 

@@ -3,6 +3,7 @@ use crate::scene::{Camera, DepthMap, Image, RgbImage, Sky};
 use glam::{DVec2, DVec3, Vec3};
 use rayon::prelude::*;
 use splatvk_infer::stuff::Surface;
+use std::ops::Range;
 
 /// Step of the differences that give normals, as a share of the longer side.
 const STEP: f64 = 1.0 / 200.0;
@@ -25,6 +26,9 @@ const STRIDE: usize = 7;
 const AROUND: f32 = 4.0;
 /// Distance behind a plane from which a point counts, relative to the region's radius.
 const BEHIND: f32 = 0.4;
+/// Width of the frame around a region in its photo in which surfaces may lie behind it, relative to
+/// the sides of the region's bounding box.
+const FRAME: f32 = 1.0;
 
 /// Points and normals of the pixels of one view.
 struct View<'a> {
@@ -43,6 +47,8 @@ pub struct Surfaces<'a> {
     /// Height of the lowest level surface, and that of the cameras above it.
     ground: Option<(f64, f64)>,
     storeys: bool,
+    /// Median height of the cameras.
+    eye: f64,
     /// Points of all views.
     points: Vec<Vec3>,
 }
@@ -62,10 +68,11 @@ impl<'a> Surfaces<'a> {
         heights.sort_unstable_by(f32::total_cmp);
         let mut above: Vec<f64> = cameras.iter().map(|c| c.pose.centre().dot(up)).collect();
         above.sort_unstable_by(f64::total_cmp);
-        let enough = heights.len() as f64 > LEAST_LEVEL * known as f64 && !above.is_empty();
+        let eye = above.get(above.len() / 2).copied().unwrap_or(0.0);
+        let enough = heights.len() as f64 > LEAST_LEVEL * known as f64;
         let ground = enough.then(|| {
             let lowest = f64::from(heights[(LOWEST * heights.len() as f64) as usize]);
-            (lowest, above[above.len() / 2] - lowest)
+            (lowest, eye - lowest)
         });
         let ground = ground.filter(|(_, cameras)| *cameras > 0.0);
         let storeys = ground.is_some_and(|(lowest, cameras)| {
@@ -75,36 +82,38 @@ impl<'a> Surfaces<'a> {
         });
         let sampled = views.iter().flat_map(|v| v.point.iter().step_by(STRIDE * STRIDE + 1).copied());
         let points = sampled.filter(|p| p.is_finite()).collect();
-        Surfaces { views, up: direction, ground, storeys, points }
+        Surfaces { views, up: direction, ground, storeys, eye, points }
     }
 
     /// The surface of each region `0..count` of a label map of one view.
     pub fn of_regions(&self, view: usize, labels: &Image<i32>, count: usize) -> Vec<Surface> {
-        let own = &self.views[view];
-        let mut sums = vec![Sums::default(); count];
+        let (own, up) = (&self.views[view], self.up.as_dvec3());
+        let mut sums: Vec<Sums> = (0..count).map(|region| Sums::of(region as i32)).collect();
         for (i, label) in labels.data.iter().enumerate() {
             if let Some(sum) = usize::try_from(*label).ok().and_then(|l| sums.get_mut(l)) {
-                sum.add(own, i);
+                sum.add(own, i, [i % labels.width, i / labels.width], up);
             }
         }
-        sums.iter().map(|s| self.surface(s, labels.data.len())).collect()
+        sums.iter().map(|s| self.surface(view, labels, s)).collect()
     }
 
-    fn surface(&self, s: &Sums, pixels: usize) -> Surface {
+    fn surface(&self, view: usize, labels: &Image<i32>, s: &Sums) -> Surface {
         let per = |n: u32| n as f32 / s.pixels.max(1) as f32;
         let mean = s.normal / s.normals.max(1) as f32;
         let centre = (s.centre / f64::from(s.points.max(1))).as_vec3();
         let squares = s.squares / f64::from(s.points.max(1)) - centre.as_dvec3().length_squared();
+        let radius = squares.max(0.0).sqrt() as f32;
+        let plane = Plane { centre, normal: self.squared(mean), radius };
         let up = f64::from(centre.dot(self.up));
         let height = |(lowest, cameras): (f64, f64)| ((up - lowest) / cameras) as f32;
         Surface {
-            share: s.pixels as f32 / pixels.max(1) as f32,
+            share: s.pixels as f32 / labels.data.len().max(1) as f32,
             sky: per(s.sky),
             known: per(s.points + s.sky),
             level: mean.normalize_or_zero().dot(self.up),
             flat: mean.length(),
             height: self.ground.filter(|_| s.points > 0).map(height),
-            behind: self.behind(centre, self.squared(mean), squares.max(0.0).sqrt() as f32),
+            behind: self.behind(&plane).max(self.behind_in_view(view, labels, s, &plane)),
             green: per(s.green),
             storeys: self.storeys,
         }
@@ -119,13 +128,46 @@ impl Surfaces<'_> {
         if along.abs() > across.length() { along.signum() * self.up } else { across.normalize_or_zero() }
     }
 
-    /// Share of the points around a plane that lie behind it.
-    fn behind(&self, centre: Vec3, normal: Vec3, radius: f32) -> f32 {
-        let near = self.points.iter().map(|p| *p - centre).filter(|p| p.length() < AROUND * radius);
+    /// Share of the scene's points around a plane that lie behind it.
+    fn behind(&self, plane: &Plane) -> f32 {
+        let all = self.points.iter().copied();
+        plane.share_behind(all.filter(|p| (*p - plane.centre).length() < AROUND * plane.radius))
+    }
+
+    /// The same of the points that the photo shows around the region, because the wall behind a box
+    /// may lie farther away than [`AROUND`]; or above it, where it ends below the cameras: a wall does
+    /// not, the front of a cupboard does.
+    fn behind_in_view(&self, view: usize, labels: &Image<i32>, s: &Sums, plane: &Plane) -> f32 {
+        let ([left, top], [right, bottom]) = (s.first, s.end);
+        let margin = |from: usize, to: usize| (FRAME * to.saturating_sub(from) as f32).ceil() as usize;
+        let (x, y) = (margin(left, right), margin(top, bottom));
+        let highest = top.saturating_sub(y);
+        let share = |columns: Range<usize>, rows: Range<usize>| {
+            let pixels = rows.flat_map(|y| columns.clone().map(move |x| y * labels.width + x));
+            let around = pixels.filter(|i| labels.data[*i] != s.region).map(|i| self.views[view].point[i]);
+            plane.share_behind(around.filter(|p| p.is_finite()))
+        };
+        let columns = left.saturating_sub(x)..(right + x).min(labels.width);
+        let around = share(columns, highest..(bottom + y).min(labels.height));
+        let ends_below = s.top() < self.eye;
+        if ends_below { around.max(share(left..right, highest..top)) } else { around }
+    }
+}
+
+/// The plane of a region.
+struct Plane {
+    centre: Vec3,
+    normal: Vec3,
+    /// Root mean square distance of the region's points from its centre.
+    radius: f32,
+}
+
+impl Plane {
+    fn share_behind(&self, points: impl Iterator<Item = Vec3>) -> f32 {
         let (mut all, mut behind) = (0u32, 0u32);
-        for from_centre in near {
+        for point in points {
             all += 1;
-            behind += u32::from(from_centre.dot(normal) < -BEHIND * radius);
+            behind += u32::from((point - self.centre).dot(self.normal) < -BEHIND * self.radius);
         }
         behind as f32 / all.max(1) as f32
     }
@@ -171,20 +213,38 @@ impl<'a> View<'a> {
 /// Sums over the pixels of a region.
 #[derive(Clone, Copy, Debug, Default)]
 struct Sums {
+    region: i32,
     pixels: u32,
+    /// Column and row of the first pixel of its bounding box, and behind the last one.
+    first: [usize; 2],
+    end: [usize; 2],
     sky: u32,
     green: u32,
     points: u32,
     centre: DVec3,
     squares: f64,
+    /// Sum of the heights, and of their squares.
+    heights: [f64; 2],
     normals: u32,
     normal: Vec3,
 }
 
 impl Sums {
-    fn add(&mut self, view: &View, i: usize) {
+    fn of(region: i32) -> Sums {
+        Sums { region, first: [usize::MAX; 2], ..Sums::default() }
+    }
+
+    /// Height of the upper end of a surface whose points are spread evenly over its height.
+    fn top(&self) -> f64 {
+        let [mean, square] = self.heights.map(|sum| sum / f64::from(self.points.max(1)));
+        mean + (3.0 * (square - mean * mean).max(0.0)).sqrt()
+    }
+
+    fn add(&mut self, view: &View, i: usize, at: [usize; 2], up: DVec3) {
         let [r, g, b] = view.image.data[i];
         self.pixels += 1;
+        self.first = [0, 1].map(|axis| self.first[axis].min(at[axis]));
+        self.end = [0, 1].map(|axis| self.end[axis].max(at[axis] + 1));
         self.sky += u32::from(view.sky[i]);
         self.green += u32::from(g - 0.5 * (r + b) > GREEN && g >= r);
         if view.point[i].is_finite() {
@@ -192,6 +252,8 @@ impl Sums {
             self.points += 1;
             self.centre += point;
             self.squares += point.length_squared();
+            let height = point.dot(up);
+            self.heights = [self.heights[0] + height, self.heights[1] + height * height];
         }
         if view.normal[i] != Vec3::ZERO {
             self.normals += 1;
@@ -205,9 +267,8 @@ mod tests {
     use super::*;
     use crate::scene::Pose;
 
-    /// A room seen from the middle: floor one below the camera, back wall four in front, and a board
-    /// at two, upright, that hides the lower middle of it.
-    fn room() -> (RgbImage, Camera, DepthMap, Image<i32>) {
+    /// The nearest of some surfaces per pixel, from their depths along a ray, and its index.
+    fn seen<const N: usize>(depths: fn(DVec3) -> [f64; N]) -> (RgbImage, Camera, DepthMap, Image<i32>) {
         let (width, height) = (160, 120);
         let camera = Camera {
             name: "a".into(),
@@ -222,16 +283,37 @@ mod tests {
         let mut labels = Image::filled(width, height, 0);
         let mut depth = Image::filled(width, height, 0.0);
         for i in 0..width * height {
-            let ray = camera.ray(DVec2::new((i % width) as f64 + 0.5, (i / width) as f64 + 0.5));
-            let floor = if ray.y > 0.0 { 1.0 / ray.y } else { f64::INFINITY };
-            let board = if ray.x.abs() < 0.15 && ray.y > -0.1 { 2.0 } else { f64::INFINITY };
-            let all = [floor, 4.0, board];
-            let nearest = (0..3).min_by(|a, b| all[*a].total_cmp(&all[*b])).unwrap();
+            let all = depths(camera.ray(DVec2::new((i % width) as f64 + 0.5, (i / width) as f64 + 0.5)));
+            let nearest = (0..N).min_by(|a, b| all[*a].total_cmp(&all[*b])).unwrap();
             (labels.data[i], depth.data[i]) = (nearest as i32, all[nearest] as f32);
         }
         let image = RgbImage { width, height, data: vec![[0.2, 0.5, 0.2]; width * height] };
         let confidence = Image::filled(width, height, 1.0);
         (image, camera, DepthMap { depth, confidence }, labels)
+    }
+
+    fn at(depth: f64, inside: bool) -> f64 {
+        if inside { depth } else { f64::INFINITY }
+    }
+
+    /// A room seen from the middle: floor one below the camera, back wall four in front, and a board
+    /// at two, upright, that hides the lower middle of it.
+    fn room() -> (RgbImage, Camera, DepthMap, Image<i32>) {
+        seen(|ray| [at(1.0 / ray.y, ray.y > 0.0), 4.0, at(2.0, ray.x.abs() < 0.15 && ray.y > -0.1)])
+    }
+
+    #[test]
+    fn front_of_cupboard_ends_below_the_cameras() {
+        // A row of fronts at two, half below the camera, with a counter between them and the wall;
+        // neighbours of a front lie on its plane.
+        let (image, camera, depth, labels) = seen(|ray| {
+            let front = |own: bool| at(2.0, ray.y > 0.25 && own);
+            let counter = at(0.5 / ray.y, ray.y > 0.0 && ray.y <= 0.25);
+            [counter, 4.0, front(ray.x.abs() < 0.1), front(ray.x.abs() >= 0.1)]
+        });
+        let surfaces = Surfaces::new(&[&image], &[camera], &[depth], DVec3::NEG_Y);
+        let [_, wall, front, _] = surfaces.of_regions(0, &labels, 4).try_into().unwrap();
+        assert!(front.behind > 0.8 && wall.behind < 0.05, "{front:?} {wall:?}");
     }
 
     #[test]

@@ -136,6 +136,8 @@ fn published(report: &ProtocolReport, scope: &Scope) -> Figures {
 /// Figures of a row with a scene, by column.
 pub(super) fn figures(o: &RowFigures, scope: &Scope) -> Figures {
     let mut out = scores(&o.scored, scope);
+    put(&mut out, "equal", o.consistency.map(|c| c.equal));
+    put(&mut out, "cosine", o.consistency.map(|c| c.cosine));
     put(&mut out, "needles", Some(o.shape.needles));
     put(&mut out, "growth", o.shape.growth);
     put(&mut out, "growth unseen", o.shape.growth_unseen);
@@ -199,6 +201,7 @@ mod tests {
             EmbeddingAgreement { frame: "c".into(), split: Split::Test, similarity: 0.5, mse: 0.1 };
         let outcome = RowFigures {
             scored: std::sync::Arc::new(Scored { report, agreement: vec![agreement], ..Scored::default() }),
+            consistency: None,
             shape: Shape::default(),
             splats: 7,
             codes: vec![1, 2],

@@ -5,6 +5,7 @@
 //! for most tables, and stages without random numbers once for all seeds. The result of a row is a
 //! [`Measurement`]; a [`FinishedTable`] holds the means. Figures are those of protocol `field` on
 //! held-out frames, or of the published protocol whose layout a data set has ([`Layout`]).
+mod consistency;
 mod data;
 mod flat;
 mod measure;
@@ -17,6 +18,7 @@ mod stages;
 mod table;
 mod tables;
 
+pub use consistency::Consistency;
 pub use data::{DataSet, Layout};
 pub use measure::Measurement;
 pub use runner::{Prepared, RowFigures, Runner, feature_bytes};

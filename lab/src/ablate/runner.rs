@@ -1,12 +1,13 @@
 //! Runs setups as graphs of stages that share one store: setups that agree up to a stage share its
 //! output.
+use super::consistency::{Consistency, DeepFrame};
 use super::data::{DataSet, Layout, Scope};
 use super::flat;
 use super::setup::{Available, Network, Regions, RowWork, Setup, TableRow};
 use super::shape::Shape;
 use super::stages::{
     EncoderEmbeddings, LabelEmbeddings, LabelledMasks, MaskEmbeddings, ObjectEmbeddings, Score,
-    ScorePublished, Scored, SyntheticEmbeddings, SyntheticMasks,
+    ScorePublished, Scored, SyntheticEmbeddings, SyntheticMasks, frames_of,
 };
 use crate::generate::regions::{self, InjectedErrors};
 use crate::{Error, Result};
@@ -17,7 +18,7 @@ use splatvk::gpu::Device;
 use splatvk::infer::Registry;
 use splatvk::infer::installed::{Installed, Task, catalogue, inventory};
 use splatvk::language::{Language, ViewMasks};
-use splatvk::photo;
+use splatvk::photo::{self, Photo};
 use splatvk::pipeline::{Context, Graph, Output, Stage, Store};
 use splatvk::pose::Geometry;
 use splatvk::progress::{Progress, Recorded};
@@ -44,6 +45,9 @@ pub struct RowFigures {
     pub scored: Arc<Scored>,
     /// Shape of the splats after the language stage.
     pub shape: Shape,
+    /// Agreement of the aligned masks of the photos with each other, by true depth, on the coarsest
+    /// level with codes. `None` without true depth.
+    pub consistency: Option<Consistency>,
     /// Number of splats of the finished scene.
     pub splats: usize,
     /// Number of codes per level.
@@ -407,6 +411,7 @@ impl<'a> Runner<'a> {
         let own: Vec<&Splats> = levels.iter().filter_map(|l| l.splats.as_ref()).collect();
         let models = if own.is_empty() { vec![&language.splats] } else { own };
         let figures = RowFigures {
+            consistency: self.consistency(&placed.photos, &made.get(s.aligned)?.field)?,
             shape: Shape::of(&trained.splats, &models, &views),
             splats: language.splats.len(),
             codes: codes.collect(),
@@ -418,6 +423,18 @@ impl<'a> Runner<'a> {
         };
         self.done.push((setup.clone(), figures.clone()));
         Ok(figures)
+    }
+
+    /// Agreement of the code maps of the photos, on the coarsest level with codes.
+    fn consistency(&self, photos: &[Photo], field: &LanguageField) -> Result<Option<Consistency>> {
+        let Some(level) = field.levels.iter().rfind(|l| !l.codebook.is_empty()) else { return Ok(None) };
+        let mut frames = Vec::new();
+        for (frame, codes) in frames_of(&self.truth, photos)?.into_iter().zip(&level.targets) {
+            if let Some(deep) = DeepFrame::read(&self.truth, frame)? {
+                frames.push((deep, codes));
+            }
+        }
+        Ok(Consistency::of(&frames, &level.codebook))
     }
 
     /// Bytes of a setup's features in training if they had the length of embeddings on three

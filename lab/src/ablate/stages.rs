@@ -50,7 +50,7 @@ pub struct Scored {
 }
 
 /// Ground-truth frame of each photo.
-fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t TruthFrame>> {
+pub(super) fn frames_of<'t>(truth: &'t GroundTruth, photos: &[Photo]) -> Result<Vec<&'t TruthFrame>> {
     let frame_of = |p: &Photo| {
         let frame = truth.frames.iter().find(|f| stem(&f.file) == p.stem);
         frame.ok_or_else(|| Error::work(format!("{}: not a frame of the data set", p.path.display())))

@@ -70,6 +70,13 @@ pub const FAULTS: [Fault; 16] = [
     Fault { name: "cameras off", kind: Kind::Cameras },
 ];
 
+impl Fault {
+    /// The kind of this name.
+    pub fn named(name: &str) -> Option<Fault> {
+        FAULTS.iter().find(|f| f.name == name).copied()
+    }
+}
+
 /// A kind of error in one scene.
 pub struct Faults {
     kind: Kind,

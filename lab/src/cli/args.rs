@@ -98,6 +98,9 @@ pub struct AlignmentArgs {
     /// Seed of the first one
     #[arg(long, default_value_t = 2000)]
     pub first: u64,
+    /// Compare feature spaces instead of steps: cosines of words, CLIP and SigLIP, and their ranks
+    #[arg(long)]
+    pub spaces: bool,
     /// Report as one line of JSON, with the figures of every scene
     #[arg(long)]
     pub json: bool,

@@ -1,12 +1,13 @@
 //! `splatlab ask`
 use super::args::AskArgs;
-use crate::protocol::{Asked, Counts, Kind, Named, Photographs};
+use crate::protocol::{Asked, Clicked, Counts, Kind, Named, Photographs};
 use crate::{Error, Result};
 use serde_json::json;
 use splatvk::cli::print::{print, print_json};
 use splatvk::cli::{progress, scene};
 use splatvk::gpu;
 use splatvk::query::QueryOptions;
+use splatvk::query::clicks::Standing;
 use splatvk::run::ask::QueryScene;
 use splatvk::run::encoder;
 use std::fmt::Write;
@@ -21,18 +22,20 @@ pub fn ask(args: &AskArgs) -> Result<()> {
             args.scene.display()
         ))
     })?;
+    let standing = Standing::of(&scene.splats, &field, &scene.cameras);
     let device = gpu::open(args.device.device.as_deref())?;
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
     let asked = photographs.ask(&mut ready, &QueryOptions::default())?;
     let named = photographs.names(&mut ready)?;
+    let clicked = photographs.clicks(&ready, &standing)?;
     ready.encoder().embedding_warning().iter().for_each(|warning| progress::print_warning(warning));
     if args.device.json {
         let counts = KINDS.map(|kind| json!({ "kind": kind, "counts": Counts::of(&asked, kind) }));
         return print_json(
-            &json!({ "scene": args.scene, "asked": asked, "named": named, "summary": counts }),
+            &json!({ "scene": args.scene, "asked": asked, "named": named, "clicked": clicked, "summary": counts }),
         );
     }
-    print(&(table(&asked) + &names(&named)))
+    print(&(table(&asked) + &names(&named) + &clicks(&clicked)))
 }
 
 fn names(named: &[Named]) -> String {
@@ -42,6 +45,24 @@ fn names(named: &[Named]) -> String {
         let mark = if n.right { "right" } else { "wrong" };
         let _ = writeln!(out, "{:24} {mark}: {} {own:.3}, next {next:.3}", n.category, n.name);
     }
+    out
+}
+
+fn clicks(clicked: &[Clicked]) -> String {
+    let mut out = String::new();
+    for c in clicked {
+        let _ = writeln!(out, "{:24} click {:.2}, best level {:.2}", c.category, c.iou, c.best);
+    }
+    let mean =
+        |value: fn(&Clicked) -> f64| clicked.iter().map(value).sum::<f64>() / clicked.len().max(1) as f64;
+    let most = clicked.iter().filter(|c| c.iou >= 0.5).count();
+    let _ = writeln!(
+        out,
+        "Clicks: {} things, IoU {:.2} (best level {:.2}), {most} with 0.5 or more",
+        clicked.len(),
+        mean(|c| c.iou),
+        mean(|c| c.best),
+    );
     out
 }
 

@@ -7,10 +7,12 @@ use serde::{Deserialize, Serialize};
 use splatvk::infer::words;
 use splatvk::photo::stem;
 use splatvk::query::QueryOptions;
+use splatvk::query::clicks::Standing;
+use splatvk::query::maps::{LevelMap, VOID};
 use splatvk::query::presence::Presence;
 use splatvk::run::answer::Answers;
 use splatvk::run::ask::QueryScene;
-use splatvk::scene::Camera;
+use splatvk::scene::{Camera, Image};
 use splatvk_types::files;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -183,6 +185,77 @@ impl Photographs {
         }
         Ok(named)
     }
+}
+
+/// A click on the middle of a labelled thing in one photo.
+#[derive(Clone, Debug, Serialize)]
+pub struct Clicked {
+    /// The category.
+    pub category: String,
+    /// IoU of the selection with the thing.
+    pub iou: f64,
+    /// The best IoU of a level's selection.
+    pub best: f64,
+}
+
+impl Photographs {
+    /// Selections by clicks on the labelled things, in the photos of the last [`Photographs::ask`].
+    pub fn clicks(&self, scene: &QueryScene, standing: &Standing) -> Result<Vec<Clicked>> {
+        let mut clicked = Vec::new();
+        for ((_, targets), frame) in self.frames.iter().zip(scene.frames()) {
+            let maps = &frame.maps;
+            for (category, target) in targets {
+                let truth = &target.mask;
+                let Some((x, y)) = middle(truth) else { continue };
+                let scaled = |p: usize, from: usize, to: usize| (2 * p + 1) * to / (2 * from);
+                let pixel =
+                    scaled(y, truth.height, maps.height) * maps.width + scaled(x, truth.width, maps.width);
+                let code = |level: &LevelMap| Some(usize::from(*level.codes.get(pixel)?));
+                let known = |level| code(level).filter(|c| *c != usize::from(VOID));
+                let codes: Vec<Option<usize>> = maps.levels.iter().map(known).collect();
+                let iou = |level: usize| {
+                    let own = maps.levels[level].codes.iter();
+                    let data = own.map(|c| Some(usize::from(*c)) == codes[level]).collect();
+                    mask_iou(&Image { width: maps.width, height: maps.height, data }, truth)
+                };
+                let levels = (0..codes.len()).filter(|level| codes[*level].is_some());
+                let all = levels.map(iou).collect::<Result<Vec<f64>>>()?;
+                let chosen = standing.level_of(&codes);
+                clicked.push(Clicked {
+                    category: category.clone(),
+                    iou: chosen.map(iou).transpose()?.unwrap_or(0.0),
+                    best: all.into_iter().fold(0.0, f64::max),
+                });
+            }
+        }
+        Ok(clicked)
+    }
+}
+
+/// The pixel of a mask that is farthest from its border, by rows and columns.
+fn middle(mask: &Image<bool>) -> Option<(usize, usize)> {
+    let (width, height) = (mask.width, mask.height);
+    let mut distance: Vec<u32> = mask.data.iter().map(|inside| if *inside { u32::MAX } else { 0 }).collect();
+    for y in 0..height {
+        for x in 0..width {
+            let before = match (x, y) {
+                (0, _) | (_, 0) => 0,
+                _ => distance[y * width + x - 1].min(distance[(y - 1) * width + x]),
+            };
+            distance[y * width + x] = distance[y * width + x].min(before.saturating_add(1));
+        }
+    }
+    for y in (0..height).rev() {
+        for x in (0..width).rev() {
+            let behind = match (x + 1 == width, y + 1 == height) {
+                (true, _) | (_, true) => 0,
+                _ => distance[y * width + x + 1].min(distance[(y + 1) * width + x]),
+            };
+            distance[y * width + x] = distance[y * width + x].min(behind.saturating_add(1));
+        }
+    }
+    let farthest = (0..distance.len()).filter(|i| mask.data[*i]).max_by_key(|i| distance[*i])?;
+    Some((farthest % width, farthest / width))
 }
 
 /// Counts of the answers of one kind.

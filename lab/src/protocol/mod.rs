@@ -16,7 +16,7 @@ mod score;
 #[cfg(test)]
 mod tests;
 
-pub use answers::{Asked, Counts, Kind, Named, Photographs, Texts};
+pub use answers::{Asked, Clicked, Counts, Kind, Named, Photographs, Texts};
 pub use labels::Labels;
 pub use score::{
     CodeScores, DecodedView, LabelledView, Masks, Protocol, ProtocolKind, ProtocolReport, ProtocolSummary,

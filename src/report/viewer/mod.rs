@@ -10,6 +10,7 @@ pub use pack::{Packed, pack};
 use super::colour;
 use crate::Result;
 use crate::format::picture;
+use crate::query::clicks::Standing;
 use crate::query::highlight::Highlight;
 use crate::query::presence::Presence;
 use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, Seen, Splats, World};
@@ -171,6 +172,7 @@ impl Scene3d<'_> {
 
     fn manifest(&self, ask_note: &str) -> Result<Value> {
         let views = self.cameras.iter().enumerate().map(|(i, c)| view(c, self.photos.get(i).copied()));
+        let standing = self.language.map(|l| Standing::of(self.splats, l, self.cameras)).unwrap_or_default();
         let words = self.language.is_some_and(|l| l.space.starts_with("words"));
         Ok(json!({
             "title": self.title, "live": false, "ask_note": ask_note,
@@ -179,18 +181,22 @@ impl Scene3d<'_> {
             "unseen": self.seen.unseen() + self.backdrop.len(),
             "metres": self.world.scale.as_ref().map(|s| s.metres_per_unit),
             "up": self.world.up.as_ref().map(|u| u.direction.to_array()),
-            "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at)).collect::<Vec<_>>(),
+            "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at, &standing)).collect::<Vec<_>>(),
             "suggested": self.suggested,
             "answers": self.answers.iter().map(ShownAnswer::json).collect::<Vec<_>>(),
         }))
     }
 
-    fn level(&self, at: usize) -> Value {
+    fn level(&self, at: usize, standing: &Standing) -> Value {
         let codes = self.language.and_then(|l| l.levels.get(at)).map_or(0, |l| l.codebook.len());
         let colours: Vec<[f32; 3]> = (0..codes).map(|k| colour::label(k as i32)).collect();
         let (title, one) = [("Subparts", "Subpart"), ("Parts", "Part"), ("Things", "Thing")][at];
         let phrases = self.names.get(at).filter(|n| n.len() == codes).cloned().unwrap_or_default();
-        json!({ "name": LEVEL_NAMES[at], "title": title, "one": one, "colours": colours, "phrases": phrases })
+        let pairs = standing.pairs().get(at).map_or(&[][..], Vec::as_slice);
+        json!({
+            "name": LEVEL_NAMES[at], "title": title, "one": one, "colours": colours, "phrases": phrases,
+            "standing": pairs,
+        })
     }
 }
 

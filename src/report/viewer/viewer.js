@@ -5,7 +5,7 @@ import { button, controls, fullScreen } from "splatvk/controls";
 import { Tape, lengthText } from "splatvk/measure";
 import { MOST, Motion, Pace, firstCamera } from "splatvk/motion";
 import { isClear, namesOf, perhaps } from "splatvk/names";
-import { pick } from "splatvk/pick";
+import { pick, sizeOfCode, wholeOf } from "splatvk/pick";
 import { askOuter, tellOuter } from "splatvk/frame";
 import { follow, kept } from "splatvk/preview";
 import { Renderer } from "splatvk/render";
@@ -402,15 +402,7 @@ function say(text, stays = false) {
 
 // --- controls -----------------------------------------------------------------------------------
 
-const sizeOf = (level, code) => splats.codes[level].reduce((n, c) => n + (c === code + 1), 0);
-
-/// Level of a click: the coarsest level with a code at this position. A code with a quarter of the
-/// splats is a table or a wall merged with its objects, so a finer level with fewer splats has
-/// priority.
-function levelOf(codes) {
-  const thing = codes.findLastIndex((code, level) => code >= 0 && sizeOf(level, code) < splats.count / 4);
-  return thing >= 0 ? thing : codes.findLastIndex((code) => code >= 0);
-}
+const sizeOf = (level, code) => sizeOfCode(splats, level, code);
 
 /// Depth and codes at a position of the canvas, CSS pixels.
 function hitAt(x, y) {
@@ -430,7 +422,7 @@ function tap(x, y, centre) {
   if (centre) return hit && motion.turn((camera) => camera.aim(placeAt(x, y, hit.depth)));
   if (tape.active) return hit ? measureAt(x, y, hit.depth) : say("Nothing to measure to there.");
   if (!hit) return clear();
-  const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : levelOf(hit.codes);
+  const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : wholeOf(splats, levels, hit.codes);
   if (level < 0) return say("Nothing that the scene has words for.");
   setQuery(null);
   select(level, hit);

@@ -19,9 +19,8 @@ pub struct Component {
 }
 
 /// Constrained union-find over the edges, best edge first. A union is refused when it would put two
-/// masks of one view together (fused masks already share a label) or when the medoids' cosine is
-/// below `veto`.
-pub(super) fn build(state: &LevelState, edges: &[Edge], veto: f64) -> Vec<Component> {
+/// masks of one view together (fused masks already share a label).
+pub(super) fn build(state: &LevelState, edges: &[Edge]) -> Vec<Component> {
     let mut groups: Vec<Component> = Vec::new();
     let mut owner: BTreeMap<MaskId, usize> = BTreeMap::new();
     for (view, areas) in state.areas.iter().enumerate() {
@@ -34,9 +33,6 @@ pub(super) fn build(state: &LevelState, edges: &[Edge], veto: f64) -> Vec<Compon
     for e in edges {
         let (Some(&a), Some(&b)) = (owner.get(&e.from), owner.get(&e.to)) else { continue };
         if a == b || shares_view(&groups[a], &groups[b]) {
-            continue;
-        }
-        if state.cosine(groups[a].medoid, groups[b].medoid) < veto {
             continue;
         }
         let (keep, absorbed) = (a.min(b), a.max(b));

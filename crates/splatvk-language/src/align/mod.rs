@@ -61,7 +61,7 @@ pub fn align(
     check(views)?;
     let mut out = Alignment { views: views.to_vec(), ..Alignment::default() };
     for level in 0..views.iter().map(|v| v.levels.len()).max().unwrap_or(0) {
-        let mut state = score::LevelState::new(&out.views, level);
+        let mut state = score::LevelState::new(&out.views, level, options.ranked);
         let masks = state.areas.iter().flatten().filter(|&&a| a > 0).count();
         let matched = if options.matching { matched } else { &[] };
         let projected = if options.reprojection { projected } else { &[] };
@@ -78,8 +78,8 @@ pub fn align(
         }
         score::add_reprojections(&mut table, &state, projected, options);
         let edges = score::undirected(table);
-        let components = components::build(&state, &edges, options.veto);
-        let cosines: f64 = edges.iter().map(|e| e.lang).sum();
+        let components = components::build(&state, &edges);
+        let cosines: f64 = edges.iter().map(|e| state.cosine(e.from, e.to).max(0.0)).sum();
         out.report.push(LevelReport {
             masks,
             components: components.len(),

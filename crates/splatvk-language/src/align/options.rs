@@ -24,14 +24,15 @@ pub struct AlignOptions {
     pub tau1: f64,
     /// Acceptance threshold of step 3.
     pub tau2: f64,
-    /// Weight of the feature cosine; the area share has 1 − λ.
+    /// Weight of the features' likeness; the area share has 1 − λ.
     pub lambda: f64,
     /// Measure of the area share.
     pub area: AreaScore,
     /// Matched pixels needed, as a share of the image ([`AlignOptions::min_matches`]).
     pub min_match_share: f64,
-    /// Smallest cosine between two masks that may become one thing.
-    pub veto: f64,
+    /// Whether the cosine of two masks counts by its rank among those of different masks of one view
+    /// (docs/internals/method.md#likeness), so that the constants hold for every encoder.
+    pub ranked: bool,
     /// Share of a mask's matches that must fall into the fusion target.
     pub containment: f64,
     /// Share of the fusion target that the masks to be fused must cover together.
@@ -64,7 +65,7 @@ impl AlignOptions {
         lambda: 0.3,
         area: AreaScore::Coverage,
         min_match_share: 2.05e-4,
-        veto: 0.5,
+        ranked: true,
         containment: 0.6,
         fusion_cover: 0.5,
         votes: true,
@@ -93,7 +94,7 @@ pub struct Edge {
     pub to: MaskId,
     /// Area share of the target.
     pub area: f64,
-    /// Cosine of the features, at least 0.
+    /// Likeness of the features: the rank of their cosine, or the cosine, at least 0.
     pub lang: f64,
     /// λ·lang + (1 − λ)·area.
     pub score: f64,

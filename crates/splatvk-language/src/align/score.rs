@@ -14,19 +14,57 @@ pub(super) struct LevelState {
     pub quality: Vec<Vec<f32>>,
     /// [view][mask] visible pixels; 0 for a mask that fusion absorbed.
     pub areas: Vec<Vec<u32>>,
+    /// Cosines of different masks of one view, ascending; empty where the cosine itself counts.
+    different: Vec<f64>,
 }
 
+/// Fewest pairs of masks of one view whose cosines make a scale.
+const LEAST_PAIRS: usize = 12;
+/// Most pairs per view.
+const MOST_PAIRS: usize = 4096;
+
 impl LevelState {
-    pub fn new(views: &[ViewMasks], level: usize) -> Self {
+    pub fn new(views: &[ViewMasks], level: usize, ranked: bool) -> Self {
         let levels: Vec<_> = views.iter().map(|v| v.levels[level].clone()).collect();
         let mut state = LevelState {
             areas: Vec::new(),
+            different: Vec::new(),
             labels: levels.iter().map(|l| l.labels.clone()).collect(),
             quality: levels.iter().map(|l| l.quality.clone()).collect(),
             features: levels.into_iter().map(|l| l.features).collect(),
         };
         state.areas = (0..views.len()).map(|t| state.count_areas(t)).collect();
+        if ranked {
+            state.different = state.cosines_within_views();
+        }
         state
+    }
+    /// Cosines of different masks of one view, ascending; none if there are too few.
+    fn cosines_within_views(&self) -> Vec<f64> {
+        let mut cosines = Vec::new();
+        for (view, areas) in self.areas.iter().enumerate() {
+            let count = areas.len();
+            let step = (count * count.saturating_sub(1) / 2).div_ceil(MOST_PAIRS).max(1);
+            let pairs = (0..count).flat_map(|a| (a + 1..count).map(move |b| (a, b))).step_by(step);
+            let visible = pairs.filter(|(a, b)| areas[*a] > 0 && areas[*b] > 0);
+            cosines.extend(visible.map(|(a, b)| self.cosine(MaskId::new(view, a), MaskId::new(view, b))));
+        }
+        if cosines.len() < LEAST_PAIRS {
+            return Vec::new();
+        }
+        cosines.sort_unstable_by(f64::total_cmp);
+        cosines
+    }
+    /// Likeness of two masks, in 0..1: the share of the pairs of different masks of one view that are
+    /// less alike, or the cosine where these are too few.
+    pub fn likeness(&self, a: MaskId, b: MaskId) -> f64 {
+        let cosine = self.cosine(a, b);
+        if self.different.is_empty() {
+            return cosine.max(0.0);
+        }
+        let below = self.different.partition_point(|c| *c < cosine);
+        let up_to = self.different.partition_point(|c| *c <= cosine);
+        0.5 * (below + up_to) as f64 / self.different.len() as f64
     }
     fn count_areas(&self, view: usize) -> Vec<u32> {
         let mut area = vec![0; self.quality[view].len()];
@@ -129,7 +167,7 @@ fn best_partner(state: &LevelState, row: &[u32], source: MaskId, view: u32) -> O
 }
 
 fn edge(state: &LevelState, step: u8, from: MaskId, to: MaskId, area: f64, options: &AlignOptions) -> Edge {
-    let lang = state.cosine(from, to).max(0.0);
+    let lang = state.likeness(from, to);
     Edge { step, from, to, area, lang, score: options.lambda * lang + (1.0 - options.lambda) * area }
 }
 
@@ -273,17 +311,11 @@ fn fusion_sets(state: &LevelState, pairs: &[PairLinks], options: &AlignOptions) 
                 let all: u32 = there.row(a).iter().sum();
                 there.at(a, b) as f64 >= options.containment * all as f64
             };
-            let alike = |&a: &usize| {
-                let others = members.iter().filter(|&&o| o != a);
-                others
-                    .into_iter()
-                    .all(|&o| state.cosine(MaskId::new(i, a), MaskId::new(i, o)) >= options.veto)
-            };
             let coverage = members.iter().map(|&a| back.at(b, a) as f64).sum::<f64>() / size;
             // with little coverage the members may be only a part of the target
             let whole = coverage >= options.fusion_cover && members.iter().all(contained);
             let agreed = || !options.votes || is_voted(&table, i, &members, j, state.labels.len());
-            if whole && members.iter().all(alike) && agreed() {
+            if whole && agreed() {
                 sets.push(FusionSet { view: i, members, target, coverage });
             }
         }

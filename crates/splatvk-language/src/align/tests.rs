@@ -256,7 +256,7 @@ fn alike(labels: Image<i32>) -> ViewMasks {
 #[test]
 fn align_keeps_pole_and_wall_apart() {
     let (a, b) = (pole_view(-0.3, 0.0), pole_view(0.4, 0.0));
-    let mut views = [alike(a.2), alike(b.2)];
+    let views = [alike(a.2), alike(b.2)];
     let projected = [links_from_depth(0, 1, (&a.0, &b.0), (&a.1, &b.1))];
     let warps = (matcher::geometry(&a.0, &a.1, &b.0, &b.1), matcher::geometry(&b.0, &b.1, &a.0, &a.1));
     let matched = [links_from_warps(0, 1, &warps.0, &warps.1)];
@@ -265,12 +265,39 @@ fn align_keeps_pole_and_wall_apart() {
         out.components[0].iter().map(|c| c.members.iter().map(|m| m.mask).collect()).collect();
     assert_eq!(pairs, [0, 1, 2].map(|k| BTreeSet::from([k])).into());
     assert!(out.components[0].iter().all(|c| c.members.len() == 2));
-    // Masks with different features stay apart although geometry joins them.
-    views[1].levels[0].features[2 * DIM..].rotate_right(1);
-    let out = align(&views, &matched, &projected, &AlignOptions::default()).unwrap();
-    assert!(out.report[0].edges.iter().any(|e| (e.from.mask, e.to.mask) == (2, 2)), "geometry joins them");
-    let of_two = out.components[0].iter().filter(|c| c.members.len() == 2);
-    assert_eq!(of_two.map(|c| c.medoid.mask).collect::<Vec<_>>(), [0, 1]);
+}
+
+#[test]
+fn likeness_is_equal_in_spaces_with_other_cosines() {
+    // Two views of `count` things whose features share `common` and differ a little between views.
+    let views = |count: usize, common: f32| {
+        let mut random = crate::math::Random::new(7);
+        let mut draw =
+            |scale: f64| -> Vec<f32> { (0..64).map(|_| (scale * random.normal()) as f32).collect() };
+        let things: Vec<Vec<f32>> = (0..count).map(|_| draw(1.0)).collect();
+        [0, 1].map(|_| {
+            let row = |thing: &Vec<f32>| -> Vec<f32> {
+                thing.iter().zip(draw(0.5)).map(|(t, noise)| t + noise + common).collect()
+            };
+            let mut features: Vec<f32> = things.iter().flat_map(row).collect();
+            crate::dir::normalise_rows(&mut features, 64);
+            let labels = Image { width: count, height: 1, data: (0..count as i32).collect() };
+            let level = LevelMasks { labels, quality: vec![1.0; count], features, ..LevelMasks::default() };
+            ViewMasks { levels: vec![level] }
+        })
+    };
+    let (a, b) = (MaskId::new(0, 0), [MaskId::new(1, 0), MaskId::new(1, 1)]);
+    let mut cosines = Vec::new();
+    for common in [0.0, 1.0, 5.0] {
+        let state = LevelState::new(&views(8, common), 0, true);
+        let [same, other] = b.map(|b| state.likeness(a, b));
+        assert!(same == 1.0 && other < 0.98, "{common}: {same} {other}");
+        cosines.push(b.map(|b| state.cosine(a, b)));
+    }
+    // Another thing of the last space has a higher cosine than the thing itself in the first one.
+    assert!(cosines[2][1] > cosines[0][0], "{cosines:?}");
+    let few = LevelState::new(&views(4, 1.0), 0, true);
+    assert_eq!(few.likeness(a, b[0]), few.cosine(a, b[0]));
 }
 
 #[test]
@@ -311,7 +338,7 @@ fn area_score_coverage_ignores_distance() {
         matcher::geometry(&far.0, &far.1, &near.0, &near.1),
     );
     let matched = [links_from_warps(0, 1, &warps.0, &warps.1)];
-    let state = LevelState::new(&views, 0);
+    let state = LevelState::new(&views, 0, false);
     let scores = |area: AreaScore| {
         let options = AlignOptions { area, tau1: 0.0, ..AlignOptions::default() };
         let table = match_proposals(&state, &matched, &options, 1);
@@ -373,7 +400,7 @@ fn fuse_takes_feature_of_stronger_set() {
         links_from_overlay(0, view, &same)
     };
     for (rows, stronger) in [([10, 8], 1), ([8, 10], 2)] {
-        let mut state = LevelState::new(&[first.clone(), left.clone(), right.clone()], 0);
+        let mut state = LevelState::new(&[first.clone(), left.clone(), right.clone()], 0, false);
         let pairs = [links(1, rows[0]), links(2, rows[1])];
         let fused = fuse(&mut state, &pairs, &AlignOptions::default());
         assert_eq!(fused.len(), 2, "all three pieces are one mask");
@@ -403,7 +430,7 @@ fn fuse_follows_most_views() {
         [([1, 2, 2], true, 0), ([1, 2, 2], false, 1), ([1, 1, 2], true, 1), ([1, 2, 0], true, 1)]
     {
         let views: Vec<ViewMasks> = [2].into_iter().chain(others).map(view).collect();
-        let mut state = LevelState::new(&views, 0);
+        let mut state = LevelState::new(&views, 0, false);
         let options = AlignOptions { votes, ..AlignOptions::default() };
         assert_eq!(fuse(&mut state, &pairs, &options).len(), fused, "{others:?} {votes}");
     }
@@ -441,7 +468,8 @@ fn same_place_score_fails_under_motion() {
         let pairs = [links_from_warps(0, 1, &warp(shift as f32, 5), &warp(-(shift as f32), 5 + shift))];
         let edges = |area: AreaScore| {
             let options = AlignOptions { area, ..AlignOptions::default() };
-            match_proposals(&LevelState::new(&[view(5), view(5 + shift)], 0), &pairs, &options, 1).len()
+            match_proposals(&LevelState::new(&[view(5), view(5 + shift)], 0, false), &pairs, &options, 1)
+                .len()
         };
         assert_eq!((edges(AreaScore::Coverage), edges(AreaScore::Paper)), (2, 2), "{shift}");
         assert_eq!(edges(AreaScore::SamePlace) > 0, agree, "{shift}");
