@@ -296,7 +296,7 @@ fn likeness_is_equal_in_spaces_with_other_cosines() {
     }
     // Another thing of the last space has a higher cosine than the thing itself in the first one.
     assert!(cosines[2][1] > cosines[0][0], "{cosines:?}");
-    let few = LevelState::new(&views(4, 1.0), 0, true);
+    let few = LevelState::new(&views(3, 1.0), 0, true);
     assert_eq!(few.likeness(a, b[0]), few.cosine(a, b[0]));
 }
 
