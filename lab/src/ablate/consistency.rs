@@ -21,16 +21,9 @@ pub struct Consistency {
 }
 
 /// A frame of the ground truth with its true depth.
-pub struct DeepFrame<'t> {
+struct DeepFrame<'t> {
     camera: &'t Camera,
     depth: Image<f32>,
-}
-
-impl<'t> DeepFrame<'t> {
-    /// Reads the depth of a frame; `None` if it has none.
-    pub fn read(truth: &GroundTruth, frame: &'t TruthFrame) -> Result<Option<DeepFrame<'t>>> {
-        Ok(truth.depth(frame)?.map(|depth| DeepFrame { camera: &frame.camera, depth }))
-    }
 }
 
 /// Image position of a pixel of one size in an image of another size.
@@ -49,8 +42,23 @@ fn depth_at(frame: &DeepFrame, position: DVec2) -> Option<f64> {
 }
 
 impl Consistency {
-    /// Compares the code maps of frames; `None` if no two frames show the same point.
-    pub fn of(frames: &[(DeepFrame, &Image<i32>)], book: &Codebook) -> Option<Consistency> {
+    /// Compares the code maps of frames; those without depth are left out. `None` if no two frames
+    /// show the same point.
+    pub fn of_frames<'t>(
+        truth: &GroundTruth,
+        maps: impl Iterator<Item = (&'t TruthFrame, &'t Image<i32>)>,
+        book: &Codebook,
+    ) -> Result<Option<Consistency>> {
+        let mut frames = Vec::new();
+        for (frame, codes) in maps {
+            if let Some(depth) = truth.depth(frame)? {
+                frames.push((DeepFrame { camera: &frame.camera, depth }, codes));
+            }
+        }
+        Ok(Consistency::of(&frames, book))
+    }
+
+    fn of(frames: &[(DeepFrame, &Image<i32>)], book: &Codebook) -> Option<Consistency> {
         let row = |code: usize| &book.embeddings[code * book.embedding_dim..][..book.embedding_dim];
         let (mut pixels, mut equal, mut cosine) = (0u64, 0u64, 0.0f64);
         for (i, (from, codes)) in frames.iter().enumerate() {

@@ -128,8 +128,12 @@ impl DataSet {
             Layout::Published(kind) => published(name, folder, kind)?,
         };
         let folder = folder.display();
-        if set.truth.labels.is_empty() {
-            return Err(Error::input(format!("{folder}: no labels to ask for in ground_truth.json")));
+        let first = set.truth.frames.first();
+        let has_depth = || first.map_or(Ok(false), |f| set.truth.depth(f).map(|depth| depth.is_some()));
+        if set.truth.labels.is_empty() && !has_depth()? {
+            return Err(Error::input(format!(
+                "{folder}: no labels to ask for in ground_truth.json, and no depth to compare photos by"
+            )));
         }
         let count = |split| set.truth.frames.iter().filter(|f| f.split == split).count();
         let (train, test) = (count(Split::Train), count(Split::Test));

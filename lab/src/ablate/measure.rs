@@ -138,6 +138,7 @@ pub(super) fn figures(o: &RowFigures, scope: &Scope) -> Figures {
     let mut out = scores(&o.scored, scope);
     put(&mut out, "equal", o.consistency.map(|c| c.equal));
     put(&mut out, "cosine", o.consistency.map(|c| c.cosine));
+    put(&mut out, "equal decoded", o.scored.decoded.map(|c| c.equal));
     put(&mut out, "needles", Some(o.shape.needles));
     put(&mut out, "growth", o.shape.growth);
     put(&mut out, "growth unseen", o.shape.growth_unseen);

@@ -1,6 +1,6 @@
 //! Runs setups as graphs of stages that share one store: setups that agree up to a stage share its
 //! output.
-use super::consistency::{Consistency, DeepFrame};
+use super::consistency::Consistency;
 use super::data::{DataSet, Layout, Scope};
 use super::flat;
 use super::setup::{Available, Network, Regions, RowWork, Setup, TableRow};
@@ -428,13 +428,8 @@ impl<'a> Runner<'a> {
     /// Agreement of the code maps of the photos, on the coarsest level with codes.
     fn consistency(&self, photos: &[Photo], field: &LanguageField) -> Result<Option<Consistency>> {
         let Some(level) = field.levels.iter().rfind(|l| !l.codebook.is_empty()) else { return Ok(None) };
-        let mut frames = Vec::new();
-        for (frame, codes) in frames_of(&self.truth, photos)?.into_iter().zip(&level.targets) {
-            if let Some(deep) = DeepFrame::read(&self.truth, frame)? {
-                frames.push((deep, codes));
-            }
-        }
-        Ok(Consistency::of(&frames, &level.codebook))
+        let maps = frames_of(&self.truth, photos)?.into_iter().zip(&level.targets);
+        Consistency::of_frames(&self.truth, maps, &level.codebook)
     }
 
     /// Bytes of a setup's features in training if they had the length of embeddings on three

@@ -1,5 +1,6 @@
 //! Stages of experiments: masks and features from ground truth, true embeddings of objects, and
 //! figures.
+use super::consistency::Consistency;
 use super::data::DataSet;
 use crate::generate::regions::{self, InjectedErrors};
 use crate::protocol::{self, CodeScores, DecodedView, ProtocolKind, ProtocolReport};
@@ -45,6 +46,9 @@ pub struct Scored {
     pub published: Option<ProtocolReport>,
     /// Agreement of embeddings, per frame.
     pub agreement: Vec<EmbeddingAgreement>,
+    /// Agreement of the decoded maps of all frames with each other, by true depth, on the coarsest
+    /// level with codes.
+    pub decoded: Option<Consistency>,
     /// Images of the models of single levels, where levels have models of their own.
     pub models: Vec<EvalReport>,
 }
@@ -197,7 +201,7 @@ impl Stage for Score {
         context: &Context,
     ) -> Result<Scored> {
         let evaluation = Evaluation::new((*self.truth).clone(), &trained.cameras, None)?;
-        let mut agreements = Vec::new();
+        let (mut agreements, mut decoded_maps) = (Vec::new(), Vec::new());
         let scale = Scale::of(embeddings);
         let levels = &language.field.levels;
         let whole = levels.iter().rposition(|l| !l.codebook.is_empty());
@@ -209,7 +213,9 @@ impl Stage for Score {
             false,
             context.progress,
             &mut |frame, decoded| {
-                let (Some(level), Some(objects)) = (whole, self.truth.objects(frame)?) else { return Ok(()) };
+                let Some(level) = whole else { return Ok(()) };
+                decoded_maps.push((frame.stem.clone(), decoded.codes[level].clone()));
+                let Some(objects) = self.truth.objects(frame)? else { return Ok(()) };
                 let book = &levels[level].codebook;
                 agreements.extend(agreement(
                     frame,
@@ -224,7 +230,13 @@ impl Stage for Score {
         )?;
         let models = levels.iter().filter_map(|l| l.splats.as_ref());
         let models = models.map(|splats| self.images(trained, splats, context)).collect::<Result<_>>()?;
-        Ok(Scored { report, agreement: agreements, published: None, models })
+        let frame_of = |stem: &String| self.truth.frames.iter().find(|f| f.stem == *stem);
+        let maps = decoded_maps.iter().filter_map(|(stem, codes)| Some((frame_of(stem)?, codes)));
+        let decoded = match whole {
+            Some(level) => Consistency::of_frames(&self.truth, maps, &levels[level].codebook)?,
+            None => None,
+        };
+        Ok(Scored { report, agreement: agreements, published: None, decoded, models })
     }
 }
 

@@ -44,7 +44,7 @@ pub static TABLES: [Table; 13] = [
     Table {
         name: "alignment",
         about: "None, step 1, steps 1 and 2, step 3, all three",
-        columns: &[("SIM", 3), ("MSE", 4), ("codes", 0), ("equal", 3), ("cosine", 3)],
+        columns: &[("SIM", 3), ("MSE", 4), ("codes", 0), ("equal", 3), ("cosine", 3), ("equal decoded", 3)],
         regions: WITH_ERRORS,
         rows: |group| {
             let row = |(label, steps): (&str, [bool; 3])| {

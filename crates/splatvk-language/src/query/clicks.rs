@@ -10,13 +10,15 @@ use std::collections::BTreeMap;
 const LARGE: f64 = 0.25;
 /// Size of a code, relative to that of the next finer one at the same place, above which it joins
 /// things: on four tuning sets the mean IoU of clicks with labelled things is 0.33 without this rule,
-/// 0.36 with 8, 0.37 with 6, 0.38 with 4 and 0.37 with 3.
+/// 0.36 with 8, 0.37 with 6, 0.38 with 4 and 0.36 with 3.
 const MOST_PARTS: usize = 6;
-/// Planes tried per code, and the most of its splats that they are tried on.
+/// Planes tried per code.
 const TRIALS: usize = 60;
+/// Most splats of a code that they are tried on.
 const SAMPLES: usize = 1500;
-/// Fewest splats of a code that may be a surface, and of a code that may stand on it.
+/// Fewest splats of a code that may be a surface.
 const LEAST_SURFACE: usize = 200;
+/// Fewest splats of a code that may stand on it.
 const LEAST_THING: usize = 20;
 /// Half the thickness of a plane, relative to the root mean square radius of the code.
 const THICKNESS: f32 = 0.03;
@@ -54,7 +56,7 @@ impl Standing {
                 let Some(plane) = Plane::of(&splats.means, list, &centres) else { continue };
                 for finer in 0..level {
                     let things = plane.carried(&splats.means, list, (&codes[finer], &standing.sizes[finer]));
-                    pairs.extend(things.map(|thing| [*code, finer, thing]));
+                    pairs.extend(things.into_iter().map(|thing| [*code, finer, thing]));
                 }
             }
             standing.pairs.push(pairs);
@@ -143,7 +145,7 @@ impl Plane {
         means: &[[f32; 3]],
         list: &[usize],
         (finer, sizes): (&[Option<usize>], &[usize]),
-    ) -> impl Iterator<Item = usize> {
+    ) -> Vec<usize> {
         let mut within: BTreeMap<usize, Vec<Vec3>> = BTreeMap::new();
         for &i in list {
             if let Some(code) = finer[i] {
@@ -157,7 +159,7 @@ impl Plane {
             let small = radius(&points) < SMALL * self.radius;
             (own && small && front >= IN_FRONT * points.len() as f64).then_some(code)
         };
-        within.into_iter().filter_map(stands).collect::<Vec<_>>().into_iter()
+        within.into_iter().filter_map(stands).collect()
     }
 }
 
