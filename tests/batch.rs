@@ -273,7 +273,12 @@ fn scenes_of_a_batch_are_those_of_run() {
     let mut run = splatvk();
     run.arg("run").arg(at("table")).arg("--out").arg(at("own")).args(["--iterations", "30"]);
     run.args(["--language-iterations", "4", "--deterministic", "--query", "lemon", "--query", "wall"]);
-    assert!(run.output().unwrap().status.success());
+    let made = run.args(["--query", "Apfel"]).output().unwrap();
+    let summary = String::from_utf8_lossy(&made.stdout);
+    assert!(
+        made.status.success() && summary.contains("“Apfel” is not among their English words"),
+        "{summary}"
+    );
     for file in ["point_cloud.ply", "language/features.npz", "cameras/transforms.json", "seen.npy"] {
         let read = |scene: &str| std::fs::read(at(scene).join(file)).unwrap();
         assert!(read("own") == read("out/table/scene"), "{file}");

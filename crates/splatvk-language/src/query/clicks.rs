@@ -148,7 +148,7 @@ impl Plane {
     ) -> Vec<usize> {
         let mut within: BTreeMap<usize, Vec<Vec3>> = BTreeMap::new();
         for &i in list {
-            if let Some(code) = finer[i] {
+            if let Some(code) = finer.get(i).copied().flatten() {
                 within.entry(code).or_default().push(Vec3::from(means[i]));
             }
         }
@@ -176,7 +176,8 @@ mod tests {
     use crate::scene::{Codebook, LevelField, Pose};
 
     /// A table of 40 × 40 splats with a cube of 6 × 6 × 6 on it, and a box of three faces beside it.
-    /// Fine codes: 0 table, 1 cube, 2 to 4 faces of the box. Coarse codes: 0 table and cube, 1 box.
+    /// Fine codes: 0 table, 1 cube, 2 to 4 faces of the box. The middle
+    /// level has no codes. Coarse codes: 0 table and cube, 1 box.
     fn scene() -> (Splats, LanguageField) {
         let (mut means, mut fine): (Vec<[f32; 3]>, Vec<usize>) = Default::default();
         let mut add = |code: usize, point: [f32; 3]| {
@@ -214,7 +215,7 @@ mod tests {
                 ..LevelField::default()
             }
         };
-        let levels = vec![level(fine, 5), level(coarse, 2)];
+        let levels = vec![level(fine, 5), LevelField::default(), level(coarse, 2)];
         (Splats { means, ..Splats::default() }, LanguageField { levels, space: "t".into() })
     }
 
@@ -226,19 +227,19 @@ mod tests {
         camera.pose.rotation = glam::DMat3::from_diagonal(glam::DVec3::new(1.0, -1.0, -1.0));
         assert!(camera.pose.centre().z > 1.0, "above the table");
         let standing = Standing::of(&splats, &field, std::slice::from_ref(&camera));
-        assert_eq!(standing.pairs()[1], [[0, 0, 1]]);
+        assert_eq!(standing.pairs()[2], [[0, 0, 1]]);
         let mut standing = standing;
-        let level = |standing: &Standing, fine, coarse| standing.level_of(&[fine, coarse]);
+        let level = |standing: &Standing, fine, coarse| standing.level_of(&[fine, None, coarse]);
         // A quarter of the splats or more on every level: the coarsest.
-        assert_eq!(level(&standing, Some(0), Some(0)), Some(1));
+        assert_eq!(level(&standing, Some(0), Some(0)), Some(2));
         standing.splats *= 10;
         assert_eq!(level(&standing, Some(1), Some(0)), Some(0));
-        assert_eq!(level(&standing, Some(0), Some(0)), Some(1));
+        assert_eq!(level(&standing, Some(0), Some(0)), Some(2));
         // A face of the box is the box; a speck with a sixth of it is a thing.
-        assert_eq!(level(&standing, Some(4), Some(1)), Some(1));
+        assert_eq!(level(&standing, Some(4), Some(1)), Some(2));
         standing.sizes[0][4] = 100;
         assert_eq!(level(&standing, Some(4), Some(1)), Some(0));
-        assert_eq!(level(&standing, None, Some(1)), Some(1));
+        assert_eq!(level(&standing, None, Some(1)), Some(2));
         assert_eq!(level(&standing, None, None), None);
     }
 }
