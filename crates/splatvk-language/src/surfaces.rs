@@ -134,9 +134,9 @@ impl Surfaces<'_> {
         plane.share_behind(all.filter(|p| (*p - plane.centre).length() < AROUND * plane.radius))
     }
 
-    /// The same of the points that the photo shows around the region, because the wall behind a box
-    /// may lie farther away than [`AROUND`]; or above it, where it ends below the cameras: a wall does
-    /// not, the front of a cupboard does.
+    /// Share of the points that the photo shows around the region and that lie behind its plane,
+    /// because the wall behind a box may lie farther away than [`AROUND`]; or of those above it,
+    /// where it ends below the cameras: a wall does not, the front of a cupboard does.
     fn behind_in_view(&self, view: usize, labels: &Image<i32>, s: &Sums, plane: &Plane) -> f32 {
         let ([left, top], [right, bottom]) = (s.first, s.end);
         let margin = |from: usize, to: usize| (FRAME * to.saturating_sub(from) as f32).ceil() as usize;
@@ -296,8 +296,8 @@ mod tests {
         if inside { depth } else { f64::INFINITY }
     }
 
-    /// A room seen from the middle: floor one below the camera, back wall four in front, and a board
-    /// at two, upright, that hides the lower middle of it.
+    /// A room seen from the middle: floor one below the camera, back wall four in front, and an
+    /// upright board at two that hides its lower middle.
     fn room() -> (RgbImage, Camera, DepthMap, Image<i32>) {
         seen(|ray| [at(1.0 / ray.y, ray.y > 0.0), 4.0, at(2.0, ray.x.abs() < 0.15 && ray.y > -0.1)])
     }

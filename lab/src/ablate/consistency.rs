@@ -89,23 +89,17 @@ impl Consistency {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splatvk::scene::Pose;
+    use splatvk::scene::{Pose, seeded};
 
     #[test]
     fn codes_of_the_same_point_are_compared() {
-        // Two cameras a pixel apart before a wall at depth 4.
-        let camera = |x: f64| Camera {
-            name: "a".into(),
-            fx: 8.0,
-            fy: 8.0,
-            cx: 4.0,
-            cy: 4.0,
-            width: 8,
-            height: 8,
-            pose: Pose { translation: glam::DVec3::new(-x, 0.0, 0.0), ..Pose::IDENTITY },
+        // Two cameras a pixel apart before a wall, at the depth of the focal length in pixels.
+        let camera = |x: f64| {
+            let pose = Pose { translation: glam::DVec3::new(-x, 0.0, 0.0), ..Pose::IDENTITY };
+            seeded::camera(8, 8, pose)
         };
-        let (left, right) = (camera(0.0), camera(0.5));
-        let frame = |camera| DeepFrame { camera, depth: Image::filled(8, 8, 4.0) };
+        let (left, right) = (camera(0.0), camera(1.0));
+        let frame = |camera| DeepFrame { camera, depth: Image::filled(8, 8, 7.2) };
         let book = Codebook {
             embedding_dim: 2,
             code_dim: 2,

@@ -119,9 +119,9 @@ impl Regime {
         if self.preset == Preset::Draft { 3 * steps } else { steps }
     }
 
-    /// Steps where the image loss is the subject. It protects the geometry, which moves slowly at the
-    /// learning rates of this stage: a draft is three times as long, the paper's schedule is long
-    /// enough.
+    /// Steps where the image loss is the subject. It protects the geometry, which moves slowly at
+    /// the learning rates of this stage: a draft is three times as long, the paper's schedule is
+    /// long enough.
     pub fn long_language(&self, iterations: usize) -> usize {
         if self.preset == Preset::Draft { 3 * iterations } else { iterations }
     }

@@ -16,7 +16,7 @@ pub struct Shape {
     /// Geometric mean of the growth of the longest axis, over splats that a photo shows. `None`:
     /// the models have other splats, or a photo shows none.
     pub growth: Option<f64>,
-    /// The same over splats that no photo shows.
+    /// Growth of the splats that no photo shows.
     pub growth_unseen: Option<f64>,
 }
 
@@ -69,7 +69,7 @@ fn is_shown(point: [f32; 3], (camera, depth): (&Camera, &DepthMap)) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splatvk::scene::{Image, Pose};
+    use splatvk::scene::{Image, Pose, seeded};
 
     fn splats(log_scales: [[f32; 3]; 2]) -> Splats {
         let mut out = Splats::with_capacity(2, 0);
@@ -85,16 +85,7 @@ mod tests {
 
     #[test]
     fn growth_is_that_of_hidden_splats_and_needles_are_long_along_one_axis() {
-        let camera = Camera {
-            name: "a".into(),
-            fx: 8.0,
-            fy: 8.0,
-            cx: 4.0,
-            cy: 4.0,
-            width: 8,
-            height: 8,
-            pose: Pose::IDENTITY,
-        };
+        let camera = seeded::camera(8, 8, Pose::IDENTITY);
         let depth = Image::filled(8, 8, 2.0);
         let confidence = Image::filled(8, 8, 1.0);
         let before = splats([[-3.0, -3.0, -6.0]; 2]);

@@ -86,8 +86,8 @@ impl TruthScene {
         Ok(Scored { seed: self.seed, steps: steps.collect::<Result<_>>()? })
     }
 
-    /// Aligns the scene's masks with a fault by all steps, in each of [`SPACES`]: by cosines, then by
-    /// their ranks.
+    /// Aligns the scene's masks with a fault by all steps, in each of [`SPACES`]: by cosines, then
+    /// by their ranks.
     pub fn score_spaces(&self, fault: &Fault) -> Result<[Vec<[Agreement; 3]>; 2]> {
         let faulty = self.with(fault);
         let in_space = |(_, weight): &(&str, f32), ranked| {

@@ -67,8 +67,8 @@ const SPACE_FAULTS: [&str; 7] = [
 /// Agreements of one scene per space, by cosines and by ranks.
 type BySpace = [Vec<[Agreement; 3]>; 2];
 
-/// Mean adjusted Rand index per fault and space, of level l and of the mean of s and m, by cosines and
-/// by their ranks; then the mean change by ranks over the scenes, with its standard error.
+/// Mean adjusted Rand index per fault and space, of level l and of the mean of s and m, by cosines
+/// and by their ranks; then the mean change by ranks over the scenes, with its standard error.
 fn spaces_table(rows: &[(&str, Vec<BySpace>)]) -> String {
     let mut out = String::new();
     for (title, of) in LEVELS {

@@ -71,9 +71,9 @@ function alphaAt(i, dx, dy, u, v, z, fx, fy, r, logScales, quats, opacity, antia
 /// Number of splats of a code.
 export const sizeOfCode = (splats, level, code) => splats.codes[level].reduce((n, c) => n + (c === code + 1), 0);
 
-/// Level that a click on a pixel with these codes selects, as in the Rust module `query::clicks`: the
-/// coarsest one whose code has less than a quarter of the splats, is at most six times as large as
-/// the next finer one, and is no surface that carries the thing.
+/// Level that a click on a pixel with these codes selects, as in the Rust module `query::clicks`:
+/// the coarsest one whose code has less than a quarter of the splats, is at most six times as large
+/// as the next finer one, and is no surface that carries the thing.
 export function wholeOf(splats, levels, codes) {
   const sizes = codes.map((code, level) => (code < 0 ? 0 : sizeOfCode(splats, level, code)));
   const carries = (code, level) => levels[level].standing.some(([on, finer, thing]) => on === code && codes[finer] === thing);

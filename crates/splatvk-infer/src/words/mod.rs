@@ -12,8 +12,8 @@
 //!
 //! Classes and stuff share one posterior and one share of the squared length. The class block
 //! separates things: a dot product of square roots is a Bhattacharyya coefficient. A text means the
-//! classes that are of the kind of its noun (`lexicon.rs`); one without a known noun means those with
-//! the nearest names, by a steep softmax. The meaning block ranks things that no class names.
+//! classes that are of the kind of its noun (`lexicon.rs`); one without a known noun means those
+//! with the nearest names, by a steep softmax. The meaning block ranks things that no class names.
 //! Sentence embeddings have the mean of the class names removed, which carries no information.
 //!
 //! A last coordinate, zero for regions, completes a text to unit length: a text that resembles no
@@ -47,8 +47,10 @@ pub fn is_space(name: &str) -> bool {
     SPACES.iter().any(|(space, _)| *space == name)
 }
 
-/// Least probability of a class that names a region.
-const NAMED: f32 = 0.2;
+/// Least probability of a class that is one of several possible names of a region.
+const POSSIBLE: f32 = 0.2;
+/// Least probability of a class that is its only name: more probable than all others together.
+const NAMED: f32 = 0.5;
 
 /// The encoder. Networks are loaded when first needed.
 pub struct RegionWords {
@@ -207,7 +209,12 @@ impl RegionEncoder for RegionWords {
         let vocabulary = self.vocabulary(&Silent)?;
         let found = nearest(regions, &vocabulary.rows(dim), dim, best);
         let name = |(mut list, region): (Vec<(usize, f32)>, &[f32])| {
-            list.retain(|(class, _)| probability(region, *class) >= NAMED);
+            list.retain(|(class, _)| probability(region, *class) >= POSSIBLE);
+            if let [(class, _)] = list[..]
+                && probability(region, class) < NAMED
+            {
+                list.clear();
+            }
             vocabulary.with_colour(list, region)
         };
         Ok(found.into_iter().zip(regions.chunks_exact(dim)).map(name).collect())

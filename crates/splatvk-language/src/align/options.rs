@@ -30,8 +30,8 @@ pub struct AlignOptions {
     pub area: AreaScore,
     /// Matched pixels needed, as a share of the image ([`AlignOptions::min_matches`]).
     pub min_match_share: f64,
-    /// Whether the cosine of two masks counts by its rank among those of different masks of one view
-    /// (docs/internals/method.md#likeness), so that the constants hold for every encoder.
+    /// Whether the cosine of two masks counts by its rank among those of different masks of one
+    /// view, so that the constants hold for every encoder (docs/internals/method.md#likeness).
     pub ranked: bool,
     /// Share of a mask's matches that must fall into the fusion target.
     pub containment: f64,

@@ -55,8 +55,8 @@ impl LevelState {
         cosines.sort_unstable_by(f64::total_cmp);
         cosines
     }
-    /// Likeness of two masks, in 0..1: the share of the pairs of different masks of one view that are
-    /// less alike, or the cosine where these are too few.
+    /// Likeness of two masks, in 0..1: the share of the pairs of different masks of one view that
+    /// are less alike, or the cosine where these are too few.
     pub fn likeness(&self, a: MaskId, b: MaskId) -> f64 {
         let cosine = self.cosine(a, b);
         if self.different.is_empty() {

@@ -9,8 +9,8 @@ use std::collections::BTreeMap;
 /// Share of all splats from which a code is a table or a wall merged with its objects.
 const LARGE: f64 = 0.25;
 /// Size of a code, relative to that of the next finer one at the same place, above which it joins
-/// things: on four tuning sets the mean IoU of clicks with labelled things is 0.33 without this rule,
-/// 0.36 with 8, 0.37 with 6, 0.38 with 4 and 0.36 with 3.
+/// things. On four tuning sets the mean IoU of clicks with labelled things is 0.33 without this
+/// rule, 0.36 with 8, 0.37 with 6, 0.38 with 4 and 0.36 with 3.
 const MOST_PARTS: usize = 6;
 /// Planes tried per code.
 const TRIALS: usize = 60;
@@ -70,9 +70,9 @@ impl Standing {
         &self.pairs
     }
 
-    /// Level that a click on a pixel with these codes, finest level first, selects: the coarsest one
-    /// whose code is not large, joins few parts and is no surface below the thing. `None` without a
-    /// code.
+    /// Level that a click on a pixel with these codes, finest level first, selects: the coarsest
+    /// one whose code is not large, joins few parts and is no surface below the thing. `None`
+    /// without a code.
     pub fn level_of(&self, codes: &[Option<usize>]) -> Option<usize> {
         let of_level = |level: &usize| codes[*level].is_some();
         let is_whole = |level: &usize| {
@@ -175,7 +175,7 @@ mod tests {
     use super::*;
     use crate::scene::{Codebook, LevelField, Pose};
 
-    /// A table of 40 × 40 splats with a cube of 6 × 6 × 6 on it, and a box of three faces beside it.
+    /// A table of 40 × 40 splats with a cube of 6 × 6 × 6 on it, and a box of three faces.
     /// Fine codes: 0 table, 1 cube, 2 to 4 faces of the box. The middle
     /// level has no codes. Coarse codes: 0 table and cube, 1 box.
     fn scene() -> (Splats, LanguageField) {
