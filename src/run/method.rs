@@ -218,6 +218,8 @@ impl Recipe {
             // the training.
             options.check_every = 0;
         }
+        // Codes of hundreds of numbers: the features of one level fill the largest buffer of a device.
+        options.per_level |= self.reducer == Reducer::Unreduced;
         match self.language {
             LanguageFit::Train => {}
             LanguageFit::Lift => (options.iterations, options.start) = (0, Start::Lifted),

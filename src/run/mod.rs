@@ -20,7 +20,7 @@ pub mod paper;
 pub mod path;
 mod photos;
 mod plan;
-mod points;
+pub mod points;
 pub mod preview;
 mod recent;
 pub mod record;

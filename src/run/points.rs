@@ -42,7 +42,7 @@ pub(super) fn read(path: &Path, progress: &dyn Progress) -> Result<PointCloud> {
 
 /// Sets the footprint that initialisation needs: `z / f` in the camera that sees the point nearest.
 /// Points outside all cameras are dropped.
-fn with_footprints(cloud: PointCloud, cameras: &[Camera], progress: &dyn Progress) -> Result<PointCloud> {
+pub fn with_footprints(cloud: PointCloud, cameras: &[Camera], progress: &dyn Progress) -> Result<PointCloud> {
     let mut kept = PointCloud::default();
     // Values that are not finite would spread in training.
     let is_finite = |i: &usize| cloud.positions[*i].iter().chain(&cloud.colours[*i]).all(|v| v.is_finite());

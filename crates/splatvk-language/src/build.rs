@@ -1,7 +1,7 @@
 //! From masks with features to components, codebooks and training targets.
 use super::ViewMasks;
 use super::align::{self, AlignOptions, Alignment, Component, PairLinks, links_from_depth};
-use super::codebook::{self, CodeEntry, EncodedLevel, autoencoder, quantise};
+use super::codebook::{self, CodeEntry, EncodedLevel, autoencoder, quantise, unreduced};
 use crate::progress::Progress;
 use crate::scene::{Camera, DepthMap, Image, LanguageField, LevelField, MaskId};
 use crate::{Error, Result};
@@ -22,6 +22,8 @@ pub enum Reducer {
     },
     /// At most 128 mean features, as LEGaussians; codes initialise an index head.
     Quantised,
+    /// None: embeddings in an orthonormal basis of their span; `feature_dim` is not used.
+    Unreduced,
 }
 
 /// How the features of a component's masks become the embedding of its code.
@@ -148,6 +150,7 @@ fn encode(alignment: &Alignment, options: &BuildOptions, progress: &dyn Progress
         Reducer::Autoencoder { least_steps } => {
             autoencoder::build(&entries, least_steps, options.seed, progress)?.0
         }
+        Reducer::Unreduced => unreduced::build(&entries),
     };
     for (level, (components, built)) in alignment.components.iter().zip(built).enumerate() {
         if built.codebook.is_empty() {

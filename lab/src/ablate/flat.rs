@@ -1,11 +1,12 @@
-//! Features in 2D, without a scene: an encoder's features of the photo's own pixels (the row "LSeg"
-//! of the paper's comparison with LSM). Every cell of a few pixels is a code of its own, so that
-//! the rules of the protocols apply unchanged.
+//! Features in 2D, without a scene (the rows "LSeg" and "SAM + LSeg" of the paper's comparison with
+//! LSM): an encoder's features of the cells of a grid, or of the masks of a photo. Every cell or
+//! mask is a code of its own, so that the rules of the protocols apply unchanged.
 use super::data::DataSet;
 use super::stages::{Scored, queries_for};
 use crate::Result;
 use crate::protocol::{self, CodeScores, DecodedView, ProtocolKind};
-use splatvk::eval::{Evaluation, GroundTruth, Rendered, Split};
+use splatvk::eval::{Evaluation, GroundTruth, Rendered, Split, TruthFrame};
+use splatvk::language::ViewMasks;
 use splatvk::progress::Progress;
 use splatvk::query::{QueryOptions, TextQuery, answer_with, field_relevancy};
 use splatvk::run::stages::SharedEncoder;
@@ -15,12 +16,19 @@ use splatvk::scene::{Camera, Codebook, Image, LanguageField, LevelField, RgbImag
 /// the size of a LERF photo.
 const CELL: usize = 4;
 
-/// Language field of one level of a photo, and the code of each pixel.
-fn photo_field(
+/// A photo with features of its own pixels.
+pub(super) struct FlatPhoto {
+    field: LanguageField,
+    /// Code per level and pixel, −1 = none.
+    codes: Vec<Image<i32>>,
+}
+
+/// Computes the features of the cells of a photo; the field has one level.
+pub(super) fn of_cells(
     image: &RgbImage,
     encoder: &SharedEncoder,
     progress: &dyn Progress,
-) -> Result<(LanguageField, Vec<Image<i32>>)> {
+) -> Result<FlatPhoto> {
     let (columns, rows) = (image.width.div_ceil(CELL), image.height.div_ceil(CELL));
     let cell_index = |p: usize| (p / image.width / CELL * columns + p % image.width / CELL) as i32;
     let labels = Image {
@@ -32,15 +40,28 @@ fn photo_field(
         encoder.with(|e| e.embed_regions(image, &labels, columns * rows, progress).map(|f| (e.dim(), f)))?;
     let codebook = Codebook { embedding_dim, embeddings, ..Codebook::default() };
     let level = LevelField { codebook, ..LevelField::default() };
-    Ok((LanguageField { levels: vec![level], space: encoder.space().to_owned() }, vec![labels]))
+    let field = LanguageField { levels: vec![level], space: encoder.space().to_owned() };
+    Ok(FlatPhoto { field, codes: vec![labels] })
+}
+
+/// The features of the masks of a photo, on every level.
+pub(super) fn of_masks(masks: ViewMasks, space: &str) -> FlatPhoto {
+    let (mut levels, mut codes) = (Vec::new(), Vec::new());
+    for level in masks.levels {
+        let embedding_dim = level.features.len().checked_div(level.quality.len()).unwrap_or(0);
+        let codebook = Codebook { embedding_dim, embeddings: level.features, ..Codebook::default() };
+        levels.push(LevelField { codebook, ..LevelField::default() });
+        codes.push(level.labels);
+    }
+    FlatPhoto { field: LanguageField { levels, space: space.to_owned() }, codes }
 }
 
 /// Scores every frame by protocol `field`.
 pub(super) fn field(
     truth: &GroundTruth,
-    encoder: &SharedEncoder,
     queries: &[TextQuery],
     progress: &dyn Progress,
+    photo_of: &mut dyn FnMut(&TruthFrame) -> Result<FlatPhoto>,
 ) -> Result<Scored> {
     let train = truth.frames.iter().filter(|f| f.split == Split::Train);
     let cameras: Vec<Camera> = train.map(|f| f.camera.clone()).collect();
@@ -50,7 +71,7 @@ pub(super) fn field(
     for (k, frame) in truth.frames.iter().enumerate() {
         progress.check()?;
         let rgb = truth.image(frame)?;
-        let (field, codes) = photo_field(&rgb, encoder, progress)?;
+        let FlatPhoto { field, codes } = photo_of(frame)?;
         let mut answers = Vec::new();
         for (label, query) in labels.iter().zip(queries) {
             let relevancy = field_relevancy(&field, query)?;
@@ -72,9 +93,9 @@ pub(super) fn field(
 pub(super) fn published(
     data: &DataSet,
     kind: ProtocolKind,
-    encoder: &SharedEncoder,
     queries: &[TextQuery],
     progress: &dyn Progress,
+    photo_of: &mut dyn FnMut(&TruthFrame) -> Result<FlatPhoto>,
 ) -> Result<Scored> {
     // Each photo is its own view; its pose does not matter.
     let cameras: Vec<Camera> =
@@ -86,7 +107,7 @@ pub(super) fn published(
     for (k, view) in views.iter().enumerate() {
         progress.check()?;
         let Some(frame) = data.truth.frames.iter().find(|f| f.stem == view.stem) else { continue };
-        let (field, codes) = photo_field(&data.truth.image(frame)?, encoder, progress)?;
+        let FlatPhoto { field, codes } = photo_of(frame)?;
         let scores = CodeScores::new(&field, &queries)?;
         protocol.add(k, &DecodedView { codes: &codes, scores: &scores })?;
         progress.step(k as u64 + 1, "");
@@ -167,7 +188,8 @@ mod tests {
         let encoder = SharedEncoder::new(Box::new(Colours), String::new());
         let miou = |red: [f32; 3]| {
             let queries = [query("blue half", [0.0, 0.0, 1.0]), query("red half", red)];
-            let scored = published(&data, ProtocolKind::Ovs, &encoder, &queries, &Silent).unwrap();
+            let mut photo_of = |frame: &TruthFrame| of_cells(&data.truth.image(frame)?, &encoder, &Silent);
+            let scored = published(&data, ProtocolKind::Ovs, &queries, &Silent, &mut photo_of).unwrap();
             scored.published.unwrap().summary["train"].figures["miou"]
         };
         assert_eq!(miou([1.0, 0.0, 0.0]), 1.0);

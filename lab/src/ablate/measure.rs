@@ -41,8 +41,8 @@ impl Measurement {
     /// Makes the measurement of a row before it runs.
     pub(super) fn begun(table: &Table, row: &TableRow, data: &str, seed: u64) -> Measurement {
         let setup = match &row.runs {
-            RowWork::Score(setup) | RowWork::MemoryOnly(setup) => serde_json::to_value(setup),
-            RowWork::Flat(features) => Ok(json!({ "flat": features })),
+            RowWork::Score(setup) => serde_json::to_value(setup),
+            RowWork::Flat(flat) => Ok(json!({ "flat": flat })),
             RowWork::Nothing => Ok(Value::Null),
         };
         Measurement {

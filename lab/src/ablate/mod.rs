@@ -5,6 +5,7 @@
 //! for most tables, and stages without random numbers once for all seeds. The result of a row is a
 //! [`Measurement`]; a [`FinishedTable`] holds the means. Figures are those of protocol `field` on
 //! held-out frames, or of the published protocol whose layout a data set has ([`Layout`]).
+mod colmap;
 mod consistency;
 mod data;
 mod flat;
@@ -18,11 +19,12 @@ mod stages;
 mod table;
 mod tables;
 
+pub use colmap::Views;
 pub use consistency::Consistency;
 pub use data::{DataSet, Layout};
 pub use measure::Measurement;
 pub use runner::{Prepared, RowFigures, Runner, feature_bytes};
-pub use setup::{Available, Network, Regime, Regions, RowWork, Setup, Sources, TableRow};
+pub use setup::{Available, Flat, Network, Regime, Regions, RowWork, Setup, Sources, TableRow};
 pub use shape::Shape;
 pub use spread::{Difference, MARGIN, Spread, Verdict};
 pub use stages::{EmbeddingAgreement, Scored};
@@ -143,7 +145,8 @@ impl Study<'_> {
             let base = self.base(lab, regions);
             let group = Group { base, sources, available: &available };
             let group_rows = (table.rows)(&group);
-            let is_base = |row: &TableRow| matches!(&row.runs, RowWork::Score(setup) if *setup == group.base);
+            let is_base =
+                |row: &TableRow| matches!(&row.runs, RowWork::Score(setup) if **setup == group.base);
             // The default setup where the table has it, else the first row.
             let reference = group_rows.iter().position(is_base).unwrap_or(0);
             rows.extend(group_rows.into_iter().enumerate().map(|(k, row)| (row, k == reference)));
@@ -173,6 +176,7 @@ impl Study<'_> {
             init: sources.init.clone(),
             true_cameras: *true_cameras,
             matcher: sources.matcher.clone(),
+            points: None,
             max_points: *max_points,
             regions,
             recipe: regime.recipe(SPARSELGS.recipe),
@@ -195,13 +199,9 @@ impl Study<'_> {
                 iou: measure::iou(&o.scored, scope),
                 ..begun.clone()
             }),
-            RowWork::Flat(features) => lab.flat(features).map(|scored| Measurement {
+            RowWork::Flat(flat) => lab.flat(flat).map(|scored| Measurement {
                 figures: measure::scores(&scored, scope),
                 iou: measure::iou(&scored, scope),
-                ..begun.clone()
-            }),
-            RowWork::MemoryOnly(setup) => lab.unreduced_bytes(setup).map(|bytes| Measurement {
-                figures: std::iter::once(("MB".to_owned(), bytes as f64 / 1e6)).collect(),
                 ..begun.clone()
             }),
             RowWork::Nothing => Ok(begun.clone()),

@@ -97,6 +97,79 @@ static BLOCKS: &[Block] = &[
         columns: IOU,
         rows: &[("sparselgs", &[0.843]), ("langsplat", &[0.884])],
     },
+    // "DC." and "SC.": COLMAP on all photos of LERF, on the three photos of 3D-OVS.
+    Block {
+        table: "colmap",
+        data: "lerf",
+        columns: TIMED,
+        rows: &[
+            ("langsplat, dense COLMAP", &[0.455, 0.616, 1200.0, 4200.0]),
+            ("legaussians, dense COLMAP", &[0.253, 0.614, 1500.0, 1800.0]),
+        ],
+    },
+    Block {
+        table: "colmap",
+        data: "lerf/ramen",
+        columns: SCORES,
+        rows: &[("langsplat, dense COLMAP", &[0.291, 0.385]), ("legaussians, dense COLMAP", &[0.222, 0.538])],
+    },
+    Block {
+        table: "colmap",
+        data: "lerf/figurines",
+        columns: SCORES,
+        rows: &[("langsplat, dense COLMAP", &[0.347, 0.571]), ("legaussians, dense COLMAP", &[0.249, 0.411])],
+    },
+    Block {
+        table: "colmap",
+        data: "lerf/teatime",
+        columns: SCORES,
+        rows: &[("langsplat, dense COLMAP", &[0.630, 0.842]), ("legaussians, dense COLMAP", &[0.328, 0.842])],
+    },
+    Block {
+        table: "colmap",
+        data: "lerf/waldo_kitchen",
+        columns: SCORES,
+        rows: &[("langsplat, dense COLMAP", &[0.551, 0.667]), ("legaussians, dense COLMAP", &[0.213, 0.667])],
+    },
+    Block {
+        table: "colmap",
+        data: "3dovs",
+        columns: &["mIoU", "Tr.T", "T.T"],
+        rows: &[
+            ("langsplat, sparse COLMAP", &[0.601, 1620.0, 6000.0]),
+            ("legaussians, sparse COLMAP", &[0.397, 2100.0, 2400.0]),
+        ],
+    },
+    Block {
+        table: "colmap",
+        data: "3dovs/bed",
+        columns: IOU,
+        rows: &[("langsplat, sparse COLMAP", &[0.558]), ("legaussians, sparse COLMAP", &[0.418])],
+    },
+    Block {
+        table: "colmap",
+        data: "3dovs/sofa",
+        columns: IOU,
+        rows: &[("langsplat, sparse COLMAP", &[0.789]), ("legaussians, sparse COLMAP", &[0.456])],
+    },
+    Block {
+        table: "colmap",
+        data: "3dovs/bench",
+        columns: IOU,
+        rows: &[("langsplat, sparse COLMAP", &[0.786]), ("legaussians, sparse COLMAP", &[0.328])],
+    },
+    Block {
+        table: "colmap",
+        data: "3dovs/room",
+        columns: IOU,
+        rows: &[("langsplat, sparse COLMAP", &[0.004]), ("legaussians, sparse COLMAP", &[0.386])],
+    },
+    Block {
+        table: "colmap",
+        data: "3dovs/desk",
+        columns: IOU,
+        rows: &[("langsplat, sparse COLMAP", &[0.868]), ("legaussians, sparse COLMAP", &[0.400])],
+    },
     Block {
         table: "bijection",
         data: "lerf",

@@ -1,4 +1,5 @@
 //! Setups of the rows of a table: photos, sources, method, steps of training.
+use super::colmap::Views;
 use serde::Serialize;
 use splatvk::fit::{LanguageOptions, Preset};
 use splatvk::language::sam::SamOptions;
@@ -153,7 +154,9 @@ pub struct Setup {
     pub true_cameras: bool,
     /// Source of dense matches for the alignment.
     pub matcher: SourceChoice,
-    /// Maximum of stereo points that splats start from; `None`: the preset's.
+    /// Folder of a COLMAP model whose points splats start from; `None`: dense stereo.
+    pub points: Option<PathBuf>,
+    /// Maximum of points that splats start from; `None`: the preset's.
     pub max_points: Option<usize>,
     /// Masks and features.
     pub regions: Regions,
@@ -165,16 +168,23 @@ pub struct Setup {
     pub language_iterations: usize,
 }
 
+/// Features in 2D, without a scene.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Flat {
+    /// Features, as of `--features`.
+    pub features: SourceChoice,
+    /// Masks that have the features, as of `--masks`; `None`: the cells of a grid.
+    pub masks: Option<SourceChoice>,
+}
+
 /// Work of a row.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub enum RowWork {
     /// Makes the scene of a setup and scores it.
-    Score(Setup),
-    /// Trains no features; computes the bytes that features of full length would take.
-    MemoryOnly(Setup),
-    /// Makes no scene; scores these features of the cells of labelled photos.
-    Flat(SourceChoice),
+    Score(Box<Setup>),
+    /// Makes no scene; scores features of labelled photos.
+    Flat(Flat),
     /// No work; the note gives the reason.
     Nothing,
 }
@@ -214,6 +224,8 @@ pub struct Available {
     /// Whether the data set is a published one, on which the paper's tables take found masks and
     /// features.
     pub published: bool,
+    /// COLMAP models with points.
+    pub models: Vec<(Views, PathBuf)>,
     /// Networks for geometry.
     pub geometry: Vec<Network>,
     /// Networks for dense matches.
@@ -238,7 +250,7 @@ impl Group<'_> {
         TableRow {
             label: label.to_owned(),
             group: self.base.regions.name(),
-            runs: RowWork::Score(setup),
+            runs: RowWork::Score(Box::new(setup)),
             note: String::new(),
         }
     }
@@ -262,6 +274,32 @@ impl Group<'_> {
             self.if_installed(row, network)
         }));
         rows
+    }
+
+    /// A row with the cameras and points of a COLMAP model, where the data set has one.
+    pub(super) fn on_model(&self, label: &str, views: Views, recipe: Recipe) -> TableRow {
+        match self.available.models.iter().find(|(v, _)| *v == views) {
+            Some((_, model)) => {
+                let init = SourceChoice::with("cameras", model);
+                let (true_cameras, points) = (false, Some(model.clone()));
+                self.row(label, Setup { init, true_cameras, points, recipe, ..self.base.clone() })
+            }
+            None => {
+                let note = format!("no COLMAP model with points in {}/0", views.folder());
+                Group::impossible(self.row(label, self.base.clone()), note)
+            }
+        }
+    }
+
+    /// A row of features in 2D, of masks or of the cells of a grid.
+    pub(super) fn flat(
+        &self,
+        label: &str,
+        masks: Option<&SourceChoice>,
+        features: &SourceChoice,
+    ) -> TableRow {
+        let flat = Flat { features: features.clone(), masks: masks.cloned() };
+        TableRow { runs: RowWork::Flat(flat), ..self.row(label, self.base.clone()) }
     }
 
     /// Returns the row, or a row without work and with an installation note where the network is

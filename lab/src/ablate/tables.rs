@@ -1,9 +1,12 @@
 //! The tables of the paper's experiments, as data: each is a list of setups that differ in one
 //! thing. The paper's own figures are in [`super::paper`].
-use super::setup::{Available, Group, Regions, RowWork, Setup, Sources, TableRow};
+use super::colmap::Views;
+use super::setup::{Available, Group, Regions, Setup, Sources, TableRow};
 use serde::Serialize;
 use splatvk::language::Reducer;
-use splatvk::run::method::{AUTOENCODER, LSM, LanguageFit, METHODS, Recipe, SPARSELGS};
+use splatvk::run::method::{
+    AUTOENCODER, LANGSPLAT, LEGAUSSIANS, LSM, LanguageFit, METHODS, Recipe, SPARSELGS,
+};
 use splatvk::run::sources::{FeatureSources, GeometrySources, MaskSources, MatchSources, SourceChoice};
 
 /// Column name, decimals.
@@ -40,7 +43,7 @@ const PERFECT: fn(&Sources, &Available) -> Vec<Regions> =
 const OWN: fn(&Sources, &Available) -> Vec<Regions> = |own, _| vec![own.regions()];
 
 /// Every table, in the order of `ablate all`.
-pub static TABLES: [Table; 13] = [
+pub static TABLES: [Table; 14] = [
     Table {
         name: "alignment",
         about: "None, step 1, steps 1 and 2, step 3, all three",
@@ -70,16 +73,13 @@ pub static TABLES: [Table; 13] = [
             let short = Recipe { feature_dim: 3, ..group.base.recipe };
             let published = Recipe { reducer: Reducer::Autoencoder { least_steps: 0 }, ..short };
             let longer = Recipe { reducer: AUTOENCODER, ..short };
+            let unreduced = Recipe { reducer: Reducer::Unreduced, ..group.base.recipe };
             vec![
                 group.row("bijection", group.base.clone()),
                 group.recipe("bijection, 3 dimensions", short),
                 group.recipe("autoencoder, 100 epochs", published),
                 group.recipe("autoencoder, 2000 steps", longer),
-                TableRow {
-                    runs: RowWork::MemoryOnly(group.base.clone()),
-                    note: "not trained: memory only".into(),
-                    ..group.row("no reduction", group.base.clone())
-                },
+                group.recipe("no reduction", unreduced),
             ]
         },
     },
@@ -90,6 +90,22 @@ pub static TABLES: [Table; 13] = [
         regions: WITH_ERRORS,
         rows: |group| {
             METHODS.iter().map(|m| group.recipe(m.name, group.base.regime.recipe(m.recipe))).collect()
+        },
+    },
+    Table {
+        name: "colmap",
+        about: "Methods on cameras and points of COLMAP, from all photos or from those of the rows",
+        columns: &[("PSNR", 2), ("splats", 0)],
+        regions: OWN,
+        rows: |group| {
+            let mut rows = vec![group.row(SPARSELGS.name, group.base.clone())];
+            for views in Views::ALL {
+                for method in [&LANGSPLAT, &LEGAUSSIANS, &SPARSELGS] {
+                    let label = format!("{}, {} COLMAP", method.name, views.name());
+                    rows.push(group.on_model(&label, views, group.base.regime.recipe(method.recipe)));
+                }
+            }
+            rows
         },
     },
     Table {
@@ -241,10 +257,11 @@ pub static TABLES: [Table; 13] = [
                 let features = SourceChoice::named(&network.name);
                 let regions = Regions::Found { masks: masks.clone(), features: features.clone() };
                 let lifted = group.row("features of lseg", Setup { regions, ..base.clone() });
-                let flat = RowWork::Flat(features);
-                let flat = TableRow { runs: flat, ..group.row("lseg in 2D", base.clone()) };
-                rows.extend([lifted, flat].map(|row| group.if_installed(row, network)));
+                let in_cells = group.flat("lseg in 2D", None, &features);
+                let in_masks = group.flat("lseg in 2D, per mask", Some(masks), &features);
+                rows.extend([lifted, in_cells, in_masks].map(|row| group.if_installed(row, network)));
             }
+            rows.push(group.flat("in 2D, per mask", Some(masks), features));
             let regions = Regions::TrueSegmentation { features: features.clone() };
             rows.push(group.row("true segmentation", Setup { regions, ..base.clone() }));
             rows
@@ -259,7 +276,7 @@ pub fn table(name: &str) -> Option<&'static Table> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::setup::{Network, Regime};
+    use super::super::setup::{Network, Regime, RowWork};
     use super::*;
 
     fn network(name: &str, fetch: Option<&str>) -> Network {
@@ -275,6 +292,7 @@ mod tests {
             init: sources.init.clone(),
             true_cameras: false,
             matcher: sources.matcher.clone(),
+            points: None,
             max_points: None,
             regions: Regions::Exact,
             recipe: SPARSELGS.recipe,
@@ -286,6 +304,7 @@ mod tests {
             views: 4,
             cameras: true,
             published: false,
+            models: vec![(Views::Dense, "model".into())],
             geometry: networks(),
             matchers: networks(),
             masks: networks(),
@@ -300,8 +319,8 @@ mod tests {
             }
             for row in &rows {
                 if let RowWork::Score(setup) = &row.runs {
-                    assert!(!setups.contains(setup), "{}: two rows of one setup", table.name);
-                    setups.push(setup.clone());
+                    assert!(!setups.contains(&**setup), "{}: two rows of one setup", table.name);
+                    setups.push((**setup).clone());
                 } else {
                     assert!(!row.note.is_empty(), "{}: {} has no note", table.name, row.label);
                 }

@@ -59,6 +59,7 @@ pub fn measure(
         init,
         true_cameras: plan.true_cameras,
         matcher,
+        points: None,
         max_points: None,
         regions: Regions::Exact,
         recipe: SPARSELGS.recipe,

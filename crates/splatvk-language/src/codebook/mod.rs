@@ -6,6 +6,7 @@ mod network;
 mod pca;
 pub(super) mod quantise;
 mod spread;
+pub(super) mod unreduced;
 
 pub use append::append;
 

@@ -1,40 +1,36 @@
 //! Runs setups as graphs of stages that share one store: setups that agree up to a stage share its
 //! output.
+mod graph;
+
+use super::colmap::Views;
 use super::consistency::Consistency;
 use super::data::{DataSet, Layout, Scope};
 use super::flat;
-use super::setup::{Available, Network, Regions, RowWork, Setup, TableRow};
+use super::setup::{Available, Flat, Network, Regime, RowWork, Setup, TableRow};
 use super::shape::Shape;
-use super::stages::{
-    EncoderEmbeddings, LabelEmbeddings, LabelledMasks, MaskEmbeddings, ObjectEmbeddings, Score,
-    ScorePublished, Scored, SyntheticEmbeddings, SyntheticMasks, frames_of,
-};
-use crate::generate::regions::{self, InjectedErrors};
+use super::stages::{Scored, frames_of};
+use crate::generate::regions;
 use crate::{Error, Result};
+use graph::known_cameras;
 use serde::{Deserialize, Serialize};
 use splatvk::eval::{BACKGROUND_LABELS, EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
-use splatvk::fit::{LanguageOptions, Preset, RgbOptions, Trained, TrainedLanguage};
+use splatvk::fit::{LanguageOptions, Preset, Trained};
 use splatvk::gpu::Device;
 use splatvk::infer::Registry;
 use splatvk::infer::installed::{Installed, Task, catalogue, inventory};
-use splatvk::language::{Language, ViewMasks};
+use splatvk::language::{Language, Reducer, ViewMasks};
 use splatvk::photo::{self, Photo};
-use splatvk::pipeline::{Context, Graph, Output, Stage, Store};
+use splatvk::pipeline::{Context, Stage, Store};
 use splatvk::pose::Geometry;
 use splatvk::progress::{Progress, Recorded};
 use splatvk::query::{QueryOptions, TextQuery};
 use splatvk::run::ask;
-use splatvk::run::compat::query_options;
 use splatvk::run::method::LIFT;
 use splatvk::run::score::{Questions, ScoredScene, score_field};
-use splatvk::run::sources::{
-    self, DepthSources, FeatureSources, GeometrySources, GraphBuilder, MaskSources, MatchSources,
-    PosedPhotos, SourceChoice,
-};
-use splatvk::run::stages::{self, CameraOrigin, PlacedPhotos, SharedEncoder};
-use splatvk::scene::{Camera, LanguageField, Splats};
-use std::collections::BTreeSet;
-use std::path::PathBuf;
+use splatvk::run::sources::{self, FeatureSources, MaskSources, SourceChoice};
+use splatvk::run::stages::{self, PlacedPhotos, SharedEncoder};
+use splatvk::scene::{LanguageField, LevelField, Splats};
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// Results of a setup.
@@ -100,18 +96,6 @@ struct Encoder {
 /// Stages whose outputs the store does not keep: trained features are large, and rows of one setup
 /// share their results.
 const PASSING: &[&str] = &["language"];
-
-/// Graph of a setup, with the outputs that [`Runner`] reads.
-struct Stages {
-    build: GraphBuilder,
-    placed: Output<PlacedPhotos>,
-    geometry: Output<Geometry>,
-    trained: Output<Trained>,
-    aligned: Output<Language>,
-    language: Output<TrainedLanguage>,
-    scored: Output<Scored>,
-    queries: Vec<TextQuery>,
-}
 
 /// Bytes of `channels` features of `splats` splats in training on views of `pixels` pixels: value,
 /// raw value, gradient and two moments each, and an image with its gradient per channel.
@@ -204,6 +188,7 @@ impl<'a> Runner<'a> {
             views: count(Split::Train) + count(Split::Test) / 2,
             cameras: self.data.layout == Layout::Own || !self.data.known.is_empty(),
             published: self.data.layout != Layout::Own,
+            models: Views::ALL.into_iter().filter_map(|v| Some((v, v.model(&self.truth.folder)?))).collect(),
             geometry: networks(&installed, Task::Geometry),
             matchers: networks(&installed, Task::Matcher),
             masks: networks(&installed, Task::Masks),
@@ -249,116 +234,6 @@ impl<'a> Runner<'a> {
         score_field(self.device, scene, questions, evaluation, false, self.progress, &mut |_, _| Ok(()))
     }
 
-    /// Builds the graph of a setup, up to its scores.
-    fn stages(&mut self, setup: &Setup) -> Result<Stages> {
-        let regime = setup.regime;
-        let frames = self.frames(setup.views)?;
-        let paths: Vec<PathBuf> = frames.iter().map(|f| self.truth.folder.join(&f.file)).collect();
-        let photos = photo::load_all(&paths, self.progress)?;
-        let registry = self.registry;
-        let given_features =
-            matches!(&setup.regions, Regions::Found { features, .. } if features.argument.is_some());
-        let mut build = GraphBuilder {
-            graph: Graph::default(),
-            registry: registry.clone(),
-            sam: regime.sam(),
-            given_features,
-            depth_prior: sources::default::<DepthSources>(),
-            preset: regime.preset,
-            seed: self.seed,
-        };
-        let posed = if setup.true_cameras {
-            let camera = |f: &TruthFrame| Camera { name: f.stem.clone(), ..f.camera.clone() }.into();
-            build.posed(photos, CameraOrigin::Known(frames.iter().map(camera).collect::<Vec<_>>().into()))?
-        } else {
-            sources::make::<GeometrySources>(&setup.init, registry, (&mut build, photos))?
-        };
-        let PosedPhotos { placed, geometry } = posed;
-        let matches = sources::make::<MatchSources>(&setup.matcher, registry, (&mut build, posed))?;
-        let options = self.rgb_options(setup);
-        let trained = build.graph.add(stages::TrainColour { options, preview: None }, (placed, geometry));
-        let RegionData { masks, embeddings, queries, space } = self.add_regions(setup, &mut build, posed)?;
-        let (recipe, seed) = (setup.recipe, self.seed);
-        let aligned = build.graph.add(stages::Align { recipe, space, seed }, (masks, matches, geometry));
-        let options = regime.language(setup.language_iterations, seed);
-        let language = build.graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
-        let scene = (trained, language, embeddings);
-        let scored = match self.data.layout {
-            Layout::Own => {
-                let options = query_options(regime.compat);
-                build.graph.add(Score { truth: self.truth.clone(), queries: queries.clone(), options }, scene)
-            }
-            Layout::Published(kind) => {
-                let score = ScorePublished { data: self.data.clone(), kind, queries: queries.clone() };
-                build.graph.add(score, scene)
-            }
-        };
-        Ok(Stages { build, placed, geometry, trained, aligned, language, scored, queries })
-    }
-
-    fn rgb_options(&self, setup: &Setup) -> RgbOptions {
-        let mut options = RgbOptions::preset(setup.regime.preset).with_iterations(setup.iterations);
-        options.seed = self.seed;
-        options.init.max_points = setup.max_points.unwrap_or(options.init.max_points);
-        setup.recipe.rgb(options)
-    }
-
-    /// Adds the stages of masks with features and of the true embeddings of objects in their space.
-    fn add_regions(
-        &mut self,
-        setup: &Setup,
-        build: &mut GraphBuilder,
-        posed: PosedPhotos,
-    ) -> Result<RegionData> {
-        let (truth, placed) = (self.truth.clone(), posed.placed);
-        let (masks, features) = match &setup.regions {
-            Regions::Found { masks, features } => (masks, features),
-            Regions::Exact => return Ok(self.synthetic(InjectedErrors::NONE, build, posed)),
-            Regions::Flawed => {
-                return Ok(self.synthetic(InjectedErrors::default_rates(self.seed), build, posed));
-            }
-            Regions::TrueSegmentation { features } => {
-                let Encoder { encoder, queries, .. } = self.encoder(features)?;
-                let (encoder, queries) = (encoder.clone(), queries.clone());
-                let masks = LabelledMasks { truth: truth.clone(), encoder: encoder.clone() };
-                let space = encoder.space().to_owned();
-                return Ok(RegionData {
-                    masks: build.graph.add(masks, (placed,)),
-                    embeddings: build.graph.add(LabelEmbeddings { truth, encoder }, ()),
-                    queries,
-                    space,
-                });
-            }
-        };
-        let registry = self.registry;
-        let Encoder { encoder, queries, .. } = self.encoder(features)?;
-        let (encoder, queries, space) = (encoder.clone(), queries.clone(), encoder.space().to_owned());
-        let found = sources::make::<MaskSources>(masks, registry, (build, posed))?;
-        let masks = build.graph.add(stages::RegionFeatures { encoder: encoder.clone() }, (placed, found));
-        let embeddings = if features.argument.is_some() {
-            build.graph.add(MaskEmbeddings { truth }, (placed, masks))
-        } else {
-            build.graph.add(EncoderEmbeddings { truth, encoder }, (placed,))
-        };
-        Ok(RegionData { masks, embeddings, queries, space })
-    }
-
-    /// Adds the stages of true masks with synthetic features.
-    fn synthetic(
-        &self,
-        flaws: InjectedErrors,
-        build: &mut GraphBuilder,
-        PosedPhotos { placed, .. }: PosedPhotos,
-    ) -> RegionData {
-        let truth = self.truth.clone();
-        RegionData {
-            masks: build.graph.add(SyntheticMasks { truth: truth.clone(), flaws }, (placed,)),
-            embeddings: build.graph.add(SyntheticEmbeddings { truth, flaws }, (placed,)),
-            queries: self.phrases().iter().map(|p| regions::query(p)).collect(),
-            space: "synthetic".into(),
-        }
-    }
-
     /// An encoder with its queries. Both are made once, because the built-in encoder compares each
     /// phrase with a thousand others.
     fn encoder(&mut self, choice: &SourceChoice) -> Result<&Encoder> {
@@ -382,14 +257,39 @@ impl<'a> Runner<'a> {
         self.truth.labels.values().filter(is_queried).cloned().collect()
     }
 
-    /// Scores features of the cells of labelled photos, without a scene.
-    pub fn flat(&mut self, choice: &SourceChoice) -> Result<Scored> {
+    /// Scores features of labelled photos, without a scene.
+    pub fn flat(&mut self, choice: &Flat) -> Result<Scored> {
         let (data, truth, progress) = (self.data.clone(), self.truth.clone(), self.progress);
-        let Encoder { encoder, queries, .. } = self.encoder(choice)?;
+        let Encoder { encoder, queries, .. } = self.encoder(&choice.features)?;
+        let (encoder, queries) = (encoder.clone(), queries.clone());
+        let mut masks = match &choice.masks {
+            Some(masks) => Some(self.flat_masks(masks, encoder.clone())?),
+            None => None,
+        };
+        let mut photo_of = |frame: &TruthFrame| match &mut masks {
+            Some(masks) => Ok(flat::of_masks(masks.remove(&frame.stem).unwrap_or_default(), encoder.space())),
+            None => flat::of_cells(&truth.image(frame)?, &encoder, progress),
+        };
         match data.layout {
-            Layout::Own => flat::field(&truth, encoder, queries, progress),
-            Layout::Published(kind) => flat::published(&data, kind, encoder, queries, progress),
+            Layout::Own => flat::field(&truth, &queries, progress, &mut photo_of),
+            Layout::Published(kind) => flat::published(&data, kind, &queries, progress, &mut photo_of),
         }
+    }
+
+    /// Masks of every frame with features, by the frame's stem.
+    fn flat_masks(
+        &self,
+        masks: &SourceChoice,
+        encoder: SharedEncoder,
+    ) -> Result<BTreeMap<String, ViewMasks>> {
+        let frames = &self.truth.frames;
+        let mut build = self.graph_builder(Regime::OWN, false);
+        let posed = build.posed(self.photos(frames)?, known_cameras(frames))?;
+        let found = sources::make::<MaskSources>(masks, self.registry, (&mut build, posed))?;
+        let found = build.graph.add(stages::RegionFeatures { encoder }, (posed.placed, found));
+        let progress = Recorded::new(self.progress);
+        let made = build.graph.run(&[found.target()], self.device, self.registry, &self.store, &progress)?;
+        Ok(frames.iter().map(|f| f.stem.clone()).zip(made.get(found)?.iter().cloned()).collect())
     }
 
     /// Runs the stages of a setup that did not run before; returns its results.
@@ -405,7 +305,12 @@ impl<'a> Runner<'a> {
         let (placed, language, scored) = (made.get(s.placed)?, made.get(s.language)?, made.get(s.scored)?);
         let levels = &language.field.levels;
         let codes = levels.iter().map(|l| l.codebook.members.iter().filter(|m| !m.is_empty()).count());
-        let channels: usize = levels.iter().map(|l| l.codebook.code_dim).sum();
+        let length = |l: &LevelField| match setup.recipe.reducer {
+            // Its codes are shorter than the embeddings that they stand for.
+            Reducer::Unreduced => l.codebook.embedding_dim,
+            _ => l.codebook.code_dim,
+        };
+        let channels: usize = levels.iter().map(length).sum();
         let (trained, geometry) = (made.get(s.trained)?, made.get(s.geometry)?);
         let views: Vec<_> = trained.cameras.iter().zip(&geometry.depths).collect();
         let own: Vec<&Splats> = levels.iter().filter_map(|l| l.splats.as_ref()).collect();
@@ -430,18 +335,6 @@ impl<'a> Runner<'a> {
         let Some(level) = field.levels.iter().rfind(|l| !l.codebook.is_empty()) else { return Ok(None) };
         let maps = frames_of(&self.truth, photos)?.into_iter().zip(&level.targets);
         Consistency::of_frames(&self.truth, maps, &level.codebook)
-    }
-
-    /// Bytes of a setup's features in training if they had the length of embeddings on three
-    /// levels.
-    pub fn unreduced_bytes(&mut self, setup: &Setup) -> Result<u64> {
-        let s = self.stages(setup)?;
-        let targets = [s.placed.target(), s.trained.target()];
-        let progress = Recorded::new(self.progress);
-        let made = s.build.graph.run(&targets, self.device, self.registry, &self.store, &progress)?;
-        let (placed, trained) = (made.get(s.placed)?, made.get(s.trained)?);
-        let length = s.queries.first().map_or(0, |q| q.embedding.len());
-        Ok(feature_bytes(trained.splats.len(), 3 * length, pixels(&placed)))
     }
 }
 
@@ -468,17 +361,9 @@ fn spread_frames(frames: &[&TruthFrame], count: usize) -> Vec<TruthFrame> {
     photo::spread(frames.len(), count).into_iter().map(|i| frames[i].clone()).collect()
 }
 
-/// Outputs and queries of [`Runner::add_regions`].
-struct RegionData {
-    masks: Output<Vec<ViewMasks>>,
-    embeddings: Output<ObjectEmbeddings>,
-    queries: Vec<TextQuery>,
-    space: String,
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::setup::{Regime, Sources};
+    use super::super::setup::{Regions, Sources};
     use super::*;
     use splatvk::progress::Silent;
     use splatvk::run::method::SPARSELGS;
@@ -497,6 +382,7 @@ mod tests {
                 init,
                 true_cameras: true,
                 matcher,
+                points: None,
                 max_points: None,
                 regions: Regions::Exact,
                 recipe: SPARSELGS.recipe,
@@ -504,7 +390,7 @@ mod tests {
                 language_iterations: 1,
             };
             let (label, group, note) = (views.to_string(), String::new(), String::new());
-            TableRow { label, group, runs: RowWork::Score(setup), note }
+            TableRow { label, group, runs: RowWork::Score(Box::new(setup)), note }
         };
         // Four photos and eight held-out views, of which the second row takes two.
         let scope = runner.scope([row(4), row(6)].iter());
