@@ -1,6 +1,6 @@
 //! The laboratory of splatvk: the tables of the paper's experiments ([`ablate`]), data with ground
 //! truth ([`generate`]), the alignment alone ([`alignment`]), figures against seconds of training
-//! ([`curve`]), evaluation protocols ([`protocol`]), and their commands ([`cli`], program
+//! ([`curve`]), pictures ([`figures`]), evaluation protocols ([`protocol`]), and their commands ([`cli`], program
 //! `splatlab`). It is not part of the installed program.
 #![warn(missing_docs)]
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
@@ -10,6 +10,7 @@ pub mod ablate;
 pub mod alignment;
 pub mod cli;
 pub mod curve;
+pub mod figures;
 pub mod generate;
 pub mod protocol;
 

@@ -23,7 +23,7 @@ pub use colmap::Views;
 pub use consistency::Consistency;
 pub use data::{DataSet, Layout};
 pub use measure::Measurement;
-pub use runner::{Prepared, RowFigures, Runner, feature_bytes};
+pub use runner::{MadeScene, Prepared, RowFigures, Runner, feature_bytes};
 pub use setup::{Available, Flat, Network, Regime, Regions, RowWork, Setup, Sources, TableRow};
 pub use shape::Shape;
 pub use spread::{Difference, MARGIN, Spread, Verdict};
@@ -79,6 +79,25 @@ impl Default for Plan {
             seeds: vec![0],
             iterations: RgbOptions::preset(Regime::OWN.preset).iterations,
             language_iterations: Regime::OWN.language_iterations(),
+        }
+    }
+}
+
+impl Plan {
+    /// Setup of rows that vary nothing.
+    pub fn base(&self, lab: &Runner, regions: Regions) -> Setup {
+        Setup {
+            regime: self.regime,
+            views: self.views.unwrap_or_else(|| lab.default_views()),
+            init: self.sources.init.clone(),
+            true_cameras: self.true_cameras,
+            matcher: self.sources.matcher.clone(),
+            points: None,
+            max_points: self.max_points,
+            regions,
+            recipe: self.regime.recipe(SPARSELGS.recipe),
+            iterations: self.iterations,
+            language_iterations: self.language_iterations,
         }
     }
 }
@@ -142,7 +161,7 @@ impl Study<'_> {
         let given = self.plan.regions.clone().map(|regions| vec![regions]);
         let mut rows: Vec<(TableRow, bool)> = Vec::new();
         for regions in given.unwrap_or_else(|| (table.regions)(sources, &available)) {
-            let base = self.base(lab, regions);
+            let base = self.plan.base(lab, regions);
             let group = Group { base, sources, available: &available };
             let group_rows = (table.rows)(&group);
             let is_base =
@@ -163,26 +182,6 @@ impl Study<'_> {
             (self.keep)(Finished { measurements: &self.measurements, table: None })?;
         }
         Ok(())
-    }
-
-    /// Setup of rows that vary nothing.
-    fn base(&self, lab: &Runner, regions: Regions) -> Setup {
-        let Plan {
-            regime, sources, views, true_cameras, max_points, iterations, language_iterations, ..
-        } = self.plan;
-        Setup {
-            regime: *regime,
-            views: views.unwrap_or_else(|| lab.default_views()),
-            init: sources.init.clone(),
-            true_cameras: *true_cameras,
-            matcher: sources.matcher.clone(),
-            points: None,
-            max_points: *max_points,
-            regions,
-            recipe: regime.recipe(SPARSELGS.recipe),
-            iterations: *iterations,
-            language_iterations: *language_iterations,
-        }
     }
 
     /// Measures a row. A failure becomes its note; a lost device and the user's stop are errors.

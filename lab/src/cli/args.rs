@@ -28,6 +28,8 @@ pub struct Lab {
 pub enum Command {
     /// Data with ground truth → the tables of the paper's experiments
     Ablate(AblateArgs),
+    /// Data with ground truth → the paper's pictures: masks of methods, locations, alignment, failures
+    Figures(FiguresArgs),
     /// Data with ground truth → quality of a training against its seconds
     Curve(CurveArgs),
     /// Generated scenes → which step of the alignment mends which error, without splats
@@ -186,13 +188,6 @@ pub struct AblateArgs {
     /// Which tables
     #[arg(value_parser = tables(), required = true, value_name = "TABLE")]
     pub tables: Vec<String>,
-    /// Folders with ground_truth.json, photos and masks, or scenes of LERF-OVS, 3D-OVS or ScanNet:
-    /// figures are means over them, with their spread
-    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
-    pub data: Vec<PathBuf>,
-    /// How the data lies, and by which protocol it is scored
-    #[arg(long, value_enum, default_value = "auto")]
-    pub layout: LayoutArg,
     /// Folder for ablate.json and one text and one chart per table, renewed after every row
     /// [default: out/ablate-NAME, after the data]
     #[arg(long, value_name = "DIR")]
@@ -200,6 +195,53 @@ pub struct AblateArgs {
     /// Write over what is there: ordinary files of the names of tables
     #[arg(long)]
     pub force: bool,
+    /// Seeds of cameras, stereo, training and injected errors: a run for each
+    #[arg(long, visible_alias = "seed", value_delimiter = ',', default_value = "0", value_name = "N,...", value_parser = whole::<u64>(0..))]
+    pub seeds: Vec<u64>,
+    /// Take the rows that an earlier run has left in --out, measured the same way, and go on from
+    /// there
+    #[arg(long)]
+    pub resume: bool,
+    /// Data and options of every row
+    #[command(flatten)]
+    pub study: StudyArgs,
+}
+
+/// `splatlab figures`
+#[derive(Debug, Args)]
+pub struct FiguresArgs {
+    /// Folder for figures.html and its pictures
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Write over what is there: ordinary files of the same names
+    #[arg(long)]
+    pub force: bool,
+    /// Methods beside each other, as of run
+    #[arg(
+        long,
+        value_delimiter = ',',
+        default_value = "sparselgs,lift,langsplat,legaussians",
+        value_name = "METHOD,..."
+    )]
+    pub methods: Vec<String>,
+    /// Seed of cameras, stereo, training and injected errors
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u64>(0..))]
+    pub seed: u64,
+    /// Data and options of every scene
+    #[command(flatten)]
+    pub study: StudyArgs,
+}
+
+/// Data sets, and the options of all scenes that are made from them.
+#[derive(Debug, Args)]
+pub struct StudyArgs {
+    /// Folders with ground_truth.json, photos and masks, or scenes of LERF-OVS, 3D-OVS or ScanNet:
+    /// figures are means over them, with their spread
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    pub data: Vec<PathBuf>,
+    /// How the data lies, and by which protocol it is scored
+    #[arg(long, value_enum, default_value = "auto")]
+    pub layout: LayoutArg,
     /// Masks and features for every row: built-in, flawed (true masks, errors injected), exact, or
     /// dir:DIR [default: those that each table is about]
     #[arg(long, value_name = "SOURCE")]
@@ -213,13 +255,6 @@ pub struct AblateArgs {
     /// Most stereo points that splats start from, in rows that do not vary it [default: draft's]
     #[arg(long, value_name = "N", value_parser = whole::<usize>(1..))]
     pub max_points: Option<usize>,
-    /// Seeds of cameras, stereo, training and injected errors: a run for each
-    #[arg(long, visible_alias = "seed", value_delimiter = ',', default_value = "0", value_name = "N,...", value_parser = whole::<u64>(0..))]
-    pub seeds: Vec<u64>,
-    /// Take the rows that an earlier run has left in --out, measured the same way, and go on from
-    /// there
-    #[arg(long)]
-    pub resume: bool,
     /// Cameras and points of every row that does not vary them, as of run [default: sfm]
     #[arg(long, value_name = "SOURCE")]
     pub init: Option<String>,

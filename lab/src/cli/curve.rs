@@ -1,6 +1,6 @@
 //! `splatlab curve`
-use super::ablate::data_sets;
 use super::args::{CurveArgs, LayoutArg};
+use super::study::data_sets;
 use crate::Result;
 use crate::curve::{self, Curve, Plan, Point, Variant};
 use serde_json::json;

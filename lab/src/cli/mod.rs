@@ -6,7 +6,9 @@ pub mod args;
 mod ask;
 mod curve;
 mod eval;
+mod figures;
 mod generate;
+mod study;
 
 use crate::Result;
 use args::{Command, Lab};
@@ -32,8 +34,12 @@ impl Program for Lab {
     fn execute(self) -> Result<()> {
         match self.command {
             Command::Ablate(mut args) => {
-                args.device.provider = self.global.provider;
+                args.study.device.provider = self.global.provider;
                 ablate::ablate(&args)
+            }
+            Command::Figures(mut args) => {
+                args.study.device.provider = self.global.provider;
+                figures::figures(&args)
             }
             Command::Curve(mut args) => {
                 args.device.provider = self.global.provider;

@@ -33,6 +33,8 @@ pub(super) struct Stages {
     pub(super) aligned: Output<Language>,
     pub(super) language: Output<TrainedLanguage>,
     pub(super) scored: Output<Scored>,
+    /// Queries of the evaluation's phrases, in its order.
+    pub(super) queries: Vec<TextQuery>,
 }
 
 impl Runner<'_> {
@@ -74,7 +76,7 @@ impl Runner<'_> {
                 build.graph.add(score, scene)
             }
         };
-        Ok(Stages { build, placed, geometry, trained, aligned, language, scored })
+        Ok(Stages { build, placed, geometry, trained, aligned, language, scored, queries })
     }
 
     pub(super) fn graph_builder(&self, regime: Regime, given_features: bool) -> GraphBuilder {

@@ -14,7 +14,7 @@ use crate::{Error, Result};
 use graph::known_cameras;
 use serde::{Deserialize, Serialize};
 use splatvk::eval::{BACKGROUND_LABELS, EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
-use splatvk::fit::{LanguageOptions, Preset, Trained};
+use splatvk::fit::{LanguageOptions, Preset, Trained, TrainedLanguage};
 use splatvk::gpu::Device;
 use splatvk::infer::Registry;
 use splatvk::infer::installed::{Installed, Task, catalogue, inventory};
@@ -70,6 +70,21 @@ pub struct Prepared {
     pub language: Language,
     /// Sum of the seconds of the stages up to the geometry.
     pub seconds: f64,
+}
+
+/// A scene of a setup.
+#[non_exhaustive]
+pub struct MadeScene {
+    /// Photos of the scene.
+    pub placed: Arc<PlacedPhotos>,
+    /// Codes of their masks.
+    pub aligned: Arc<Language>,
+    /// Cameras and splats of the colour stage.
+    pub trained: Arc<Trained>,
+    /// Splats with features.
+    pub language: Arc<TrainedLanguage>,
+    /// Queries of the evaluation's phrases, in its order.
+    pub queries: Vec<TextQuery>,
 }
 
 /// Runs setups on one data set and one device, and keeps their outputs.
@@ -328,6 +343,35 @@ impl<'a> Runner<'a> {
         };
         self.done.push((setup.clone(), figures.clone()));
         Ok(figures)
+    }
+
+    /// Makes the scene of a setup, without scores.
+    pub fn scene(&mut self, setup: &Setup) -> Result<MadeScene> {
+        let s = self.stages(setup)?;
+        let targets = [s.placed.target(), s.aligned.target(), s.trained.target(), s.language.target()];
+        let progress = Recorded::new(self.progress);
+        let made = s.build.graph.run(&targets, self.device, self.registry, &self.store, &progress)?;
+        Ok(MadeScene {
+            placed: made.get(s.placed)?,
+            aligned: made.get(s.aligned)?,
+            trained: made.get(s.trained)?,
+            language: made.get(s.language)?,
+            queries: s.queries,
+        })
+    }
+
+    /// Aligns the masks of a setup with each other, without training.
+    pub fn aligned(&mut self, setup: &Setup) -> Result<Arc<Language>> {
+        let s = self.stages(setup)?;
+        let progress = Recorded::new(self.progress);
+        let made =
+            s.build.graph.run(&[s.aligned.target()], self.device, self.registry, &self.store, &progress)?;
+        made.get(s.aligned)
+    }
+
+    /// The frames, labels and cameras of the data set.
+    pub fn data(&self) -> &DataSet {
+        &self.data
     }
 
     /// Agreement of the code maps of the photos, on the coarsest level with codes.
