@@ -1,8 +1,12 @@
 //! Tables on data sets of the published layouts, and the script that runs all of them, on small
 //! imitations made from generated scenes.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is how a test fails
+use glam::DVec2;
 use image::GenericImageView;
 use serde_json::{Value, json};
+use splatvk::eval::GroundTruth;
+use splatvk::format::colmap;
+use splatvk::scene::{Camera, PointCloud};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -245,12 +249,70 @@ fn true_segmentation_scores_in_every_layout() {
         // Found masks score less than true ones.
         let own = row(&report, "sparselgs")["figures"]["mIoU"].as_f64().unwrap();
         assert!(own < figure("mIoU"), "{layout}: {own} {figures}");
-        for label in ["features of lseg", "lseg in 2D"] {
+        // Those that are found in the photos themselves, without a scene.
+        let flat = &row(&report, "in 2D, per mask")["figures"];
+        assert!(flat["mIoU"].as_f64().unwrap() > 0.0 && flat["Tr.T"].is_null(), "{layout}: {flat}");
+        for label in ["features of lseg", "lseg in 2D", "lseg in 2D, per mask"] {
             let note = row(&report, label)["note"].as_str().unwrap();
             assert_eq!(note, "not installed: splatvk models fetch lseg");
         }
         // The draft preset does not measure what the paper's figures measure.
         assert_eq!(row(&report, "sparselgs")["paper"], json!({}), "{layout}");
+    }
+}
+
+/// Replaces the cameras of a LERF scene by a COLMAP model of all photos, with points of true depth.
+fn with_colmap_model(scene: &Scene, folder: &Path) {
+    let truth = GroundTruth::read(&scene.folder.path().join("data")).unwrap();
+    let (mut cameras, mut points) = (Vec::new(), PointCloud::default());
+    for (view, frame) in truth.frames.iter().enumerate() {
+        let depth = truth.depth(frame).unwrap().unwrap();
+        cameras.push(Camera { name: format!("{}.jpg", frame.stem), ..frame.camera.clone() });
+        for i in (0..depth.data.len()).step_by(41).filter(|&i| depth.data[i] > 0.0) {
+            let pixel = DVec2::new((i % depth.width) as f64 + 0.5, (i / depth.width) as f64 + 0.5);
+            let point = frame.camera.unproject(pixel, f64::from(depth.data[i]));
+            points.positions.push(point.as_vec3().to_array());
+            points.colours.push([0.5; 3]);
+            points.confidence.push(1.0);
+            points.view.push(view as u32);
+            points.radius.push(0.0);
+        }
+    }
+    std::fs::remove_file(folder.join("transforms.json")).unwrap();
+    std::fs::create_dir_all(folder.join("sparse/0")).unwrap();
+    colmap::write_binary(&folder.join("sparse/0"), &cameras, Some(&points)).unwrap();
+}
+
+#[test]
+#[ignore = "takes long: tools/test-long"]
+fn colmap_models_are_rows_and_figures_are_drawn() {
+    let scene = Scene::generate("1003");
+    let root = tempfile::tempdir().unwrap();
+    as_lerf(&scene, &root.path().join("lerf_ovs"), "teatime");
+    let data = root.path().join("lerf_ovs/teatime");
+    with_colmap_model(&scene, &data);
+    let report = ablate(&["colmap"], &data, &root.path().join("out"));
+    for method in ["langsplat", "legaussians", "sparselgs"] {
+        let dense = row(&report, &format!("{method}, dense COLMAP"));
+        assert!(dense["figures"]["mIoU"].is_f64(), "{dense}");
+        let sparse = row(&report, &format!("{method}, sparse COLMAP"));
+        assert_eq!(sparse["note"], "no COLMAP model with points in sparse_views/0");
+    }
+    let figure = |label: &str, name: &str| row(&report, label)["figures"][name].as_f64().unwrap();
+    let (stereo, points) = (figure("sparselgs", "splats"), figure("sparselgs, dense COLMAP", "splats"));
+    assert!(points < 0.7 * stereo && points > 1000.0, "{points} {stereo}");
+
+    let pages = root.path().join("figures");
+    let args = ["figures", "--data", path(&data), "--out", path(&pages), "--methods", "sparselgs,langsplat"];
+    let output = splatlab(&[&args[..], &SHORT].concat());
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let page = std::fs::read_to_string(pages.join("figures.html")).unwrap();
+    let files: Vec<&str> = page.split("src=\"").skip(1).map(|p| p.split('"').next().unwrap()).collect();
+    for section in ["masks", "locations", "alignment-s", "alignment-l", "failures"] {
+        assert!(files.iter().any(|f| f.starts_with(section)), "no picture of {section}: {files:?}");
+    }
+    for file in files {
+        assert_eq!(image::open(pages.join(file)).unwrap().dimensions(), (160, 120), "{file}");
     }
 }
 

@@ -51,7 +51,9 @@ fn ablate_measures_generated_scene() {
         figure(0, "SIM").unwrap() > figure(2, "SIM").unwrap() && figure(0, "mIoU").unwrap() > 0.3,
         "{rows:?}"
     );
-    assert!(figure(4, "mIoU").is_none() && figure(4, "MB").unwrap() > 10.0 * figure(0, "MB").unwrap());
+    // Exact masks have few codes, which one basis holds as well as another.
+    assert!(figure(4, "mIoU").unwrap() > figure(0, "mIoU").unwrap() - 0.05, "{rows:?}");
+    assert!(figure(4, "MB").unwrap() > 10.0 * figure(0, "MB").unwrap(), "{rows:?}");
     for file in ["bijection.txt", "bijection.svg", "ablate.json"] {
         assert!(out.join(file).metadata().unwrap().len() > 100, "{file}");
     }

@@ -3,9 +3,13 @@
 use crate::gpu::shaders::decode::{MIN_FEATURE_SHARE, PIXELS, VOID_ALPHA, WORKGROUP};
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 use crate::{Error, Result};
+use rayon::prelude::*;
 
 /// Code widths of the variants of glsl/decode.comp; other codes are padded with zeros.
-const WIDTHS: [usize; 4] = [4, 8, 16, 32];
+const WIDTHS: [usize; 4] = [4, 8, 16, LONGEST_CODE];
+
+/// Longest code that the device decodes.
+pub const LONGEST_CODE: usize = 32;
 
 /// Pixels per workgroup.
 const PIXELS_PER_GROUP: u32 = WORKGROUP[0] * PIXELS;
@@ -19,10 +23,12 @@ pub struct Codes {
 }
 
 impl Codes {
-    /// Uploads `codes`, `[K, dim]`, row-major, unit rows; `dim` is 1 to 32.
+    /// Uploads `codes`, `[K, dim]`, row-major, unit rows; `dim` is 1 to [`LONGEST_CODE`].
     pub fn upload(device: &Device, codes: &[f32], dim: usize) -> Result<Codes> {
         let Some(&width) = WIDTHS.iter().find(|&&w| w >= dim).filter(|_| dim > 0) else {
-            return Err(Error::work(format!("codes have {dim} components, the decoder takes 1 to 32")));
+            return Err(Error::work(format!(
+                "codes have {dim} components, the decoder takes 1 to {LONGEST_CODE}"
+            )));
         };
         let mut padded = Vec::with_capacity(codes.len() / dim * width);
         for code in codes.chunks_exact(dim) {
@@ -67,7 +73,7 @@ impl Codes {
 pub fn decode_pixels(codes: &[f32], dim: usize, features: &[f32], alpha: &[f32]) -> (Vec<i32>, Vec<f64>) {
     let pixels = alpha.len();
     let feature = |p: usize| -> Vec<f64> { (0..dim).map(|c| f64::from(features[c * pixels + p])).collect() };
-    (0..pixels).map(|p| decode_pixel(codes, &feature(p), alpha[p])).unzip()
+    (0..pixels).into_par_iter().map(|p| decode_pixel(codes, &feature(p), alpha[p])).unzip()
 }
 
 /// Code and margin of one pixel.

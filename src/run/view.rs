@@ -3,7 +3,7 @@ use super::border::Border;
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder};
 use crate::pass::bands::Band;
-use crate::pass::decode::Codes;
+use crate::pass::decode::{Codes, LONGEST_CODE, decode_pixels};
 use crate::pass::raster_forward::BASE_CHANNELS;
 use crate::pass::rasterizer::FrameBuffers;
 use crate::pass::renderer::{RenderedFrame, Renderer};
@@ -64,11 +64,27 @@ struct Model {
 /// models (`shown`).
 struct CarriedLevel {
     level: usize,
-    codes: Codes,
+    codes: LevelCodes,
     /// Restriction of short codes to those in the pixel.
     border: Option<Border>,
     channels: Range<usize>,
     shown: Range<usize>,
+}
+
+/// Codes of a level where they are compared with pixels.
+enum LevelCodes {
+    Device(Codes),
+    /// Longer than the device decodes: embeddings without reduction.
+    Host(Vec<f32>),
+}
+
+impl LevelCodes {
+    fn new(device: &Device, codes: &[f32], dim: usize) -> Result<LevelCodes> {
+        match dim <= LONGEST_CODE {
+            true => Codes::upload(device, codes, dim).map(LevelCodes::Device),
+            false => Ok(LevelCodes::Host(codes.to_vec())),
+        }
+    }
 }
 
 impl CarriedLevel {
@@ -113,7 +129,7 @@ impl Model {
         let mut levels: Vec<CarriedLevel> = Vec::with_capacity(carried.len());
         for &level in carried {
             let (first, d) = (levels.last().map_or(0, |l| l.channels.end), shown[level].len());
-            let codes = Codes::upload(device, &field.levels[level].codebook.codes, d)?;
+            let codes = LevelCodes::new(device, &field.levels[level].codebook.codes, d)?;
             let border = Border::new(device, splats, &field.levels[level])?;
             let (channels, shown) = (first..first + d, shown[level].clone());
             levels.push(CarriedLevel { level, codes, border, channels, shown });
@@ -268,13 +284,25 @@ fn decode(
         None => device.buffer::<i32>("decoded", pixels as usize)?,
     };
     for level in levels {
-        let mut rec = Recorder::new(device, "decode");
-        let first_plane = (BASE_CHANNELS + level.channels.start) as u32;
+        let first_plane = BASE_CHANNELS + level.channels.start;
         let (planes, transmittance) = (&frame.planes, &frame.transmittance);
-        level.codes.record(&mut rec, planes, first_plane, transmittance, pixels, &decoded);
-        rec.run()?;
         let (stored, inner) = (frame.bands.stored(band), frame.bands.inner(band));
-        codes[level.level].data[inner].copy_from_slice(&decoded.read_range(stored)?);
+        let found = match &level.codes {
+            LevelCodes::Device(codes) => {
+                let mut rec = Recorder::new(device, "decode");
+                codes.record(&mut rec, planes, first_plane as u32, transmittance, pixels, &decoded);
+                rec.run()?;
+                decoded.read_range(stored)?
+            }
+            LevelCodes::Host(codes) => {
+                let (pixels, dim) = (pixels as usize, level.channels.len());
+                let features = planes.read_range(first_plane * pixels..(first_plane + dim) * pixels)?;
+                let alpha: Vec<f32> =
+                    transmittance.read_range(0..pixels)?.into_iter().map(|t| 1.0 - t).collect();
+                decode_pixels(codes, dim, &features, &alpha).0[stored].to_vec()
+            }
+        };
+        codes[level.level].data[inner].copy_from_slice(&found);
     }
     *output = Some(decoded);
     Ok(())

@@ -39,7 +39,7 @@ impl Tile {
 
 const STYLE: &str = "body{font:15px system-ui,sans-serif;margin:2em;color:#222;background:#fff}\
 table{border-collapse:collapse;margin-bottom:2.5em}th{font-weight:600;text-align:left;padding:.2em .4em}\
-td{padding:.2em .4em;vertical-align:top}img{width:15em;display:block}td span{font-size:13px;color:#555}";
+td{padding:.2em .4em;vertical-align:top}img{width:12em;display:block}td span{font-size:13px;color:#555}";
 
 impl Section {
     /// File of a picture, relative to the page.
