@@ -1,11 +1,15 @@
 //! COLMAP models of a data set: cameras and sparse points in place of dense stereo (the rows "DC." and
 //! "SC." of the paper).
-use crate::Result;
+use crate::{Error, Result};
+use glam::Vec3;
 use serde::Serialize;
 use splatvk::format::colmap;
+use splatvk::photo::stem;
 use splatvk::pipeline::{Context, Lane, Output, Stage};
 use splatvk::pose::Geometry;
+use splatvk::pose::align::pose_errors;
 use splatvk::run::points;
+use splatvk::scene::{Camera, Similarity};
 use std::path::{Path, PathBuf};
 
 /// Photos of a COLMAP model.
@@ -63,8 +67,28 @@ impl Stage for StartFromPoints {
     }
 
     fn run(self, (geometry,): (&Geometry,), context: &Context) -> Result<Geometry> {
-        let cloud = colmap::read_points(&self.model)?;
+        let mut cloud = colmap::read_points(&self.model)?;
+        let to_scene = self.similarity(&geometry.cameras)?;
+        for position in &mut cloud.positions {
+            *position = to_scene.transform(Vec3::from(*position).as_dvec3()).as_vec3().to_array();
+        }
         let points = points::with_footprints(cloud, &geometry.cameras, context.progress)?;
         Ok(Geometry { points, depths: Vec::new(), ..geometry.clone() })
+    }
+}
+
+impl StartFromPoints {
+    /// Similarity from the world of the model to that of the scene: both have the cameras of the
+    /// photos.
+    fn similarity(&self, scene: &[Camera]) -> Result<Similarity> {
+        let model = colmap::read(&self.model)?;
+        let camera_of = |own: &Camera| {
+            let found = model.iter().find(|g| stem(&g.camera.name) == stem(&own.name));
+            found
+                .map(|g| g.camera.clone())
+                .ok_or_else(|| Error::input(format!("{}: no camera of {}", self.model.display(), own.name)))
+        };
+        let model = scene.iter().map(camera_of).collect::<Result<Vec<_>>>()?;
+        Ok(pose_errors(&model, scene, 1.0).similarity)
     }
 }
