@@ -7,7 +7,7 @@ use std::fmt::Write;
 pub struct Section {
     /// Beginning of its file names.
     pub name: &'static str,
-    /// What the pictures show.
+    /// Subject of the pictures.
     pub about: String,
     /// Headings.
     pub columns: Vec<String>,

@@ -46,10 +46,12 @@ fn coordinates(rows: &[f32], width: usize, dim: usize) -> Vec<f32> {
             let (a, b) = (&factor[k * dim..k * dim + j], &factor[j * dim..j * dim + j]);
             let rest = dot(rows[k], rows[j]) - a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
             let pivot = factor[j * dim + j];
-            factor[k * dim + j] = match j == k {
-                true if rest > IN_SPAN => rest.sqrt(),
-                false if pivot > 0.0 => rest / pivot,
-                _ => 0.0,
+            factor[k * dim + j] = if j < k && pivot > 0.0 {
+                rest / pivot
+            } else if j == k && rest > IN_SPAN {
+                rest.sqrt()
+            } else {
+                0.0
             };
         }
     }
