@@ -237,6 +237,13 @@ pub struct QueryArgs {
     /// Also write the splats that each text means, as TEXT/splats.ply
     #[arg(long, requires = "out")]
     pub splats: bool,
+    /// Ask this network about every photo, instead of the scene's own language: sam3, or the name
+    /// of an installed concept network
+    #[arg(long, value_name = "NETWORK", conflicts_with = "compat")]
+    pub concepts: Option<String>,
+    /// Undistorted photos for --concepts, named like the cameras [default: those in the scene]
+    #[arg(long, value_name = "DIR", requires = "concepts")]
+    pub photos: Option<PathBuf>,
     /// Choose level, mask and location as others do [default: as the scene was made]
     #[arg(long, value_parser = compats(), value_name = "WHOSE", help_heading = EXPERTS)]
     pub compat: Option<String>,

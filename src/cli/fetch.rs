@@ -73,17 +73,18 @@ pub fn fetch(args: &FetchArgs) -> Result<()> {
     print_summary(args, &all, &reports)
 }
 
-/// Refuses models whose licence forbids commercial use unless it was accepted.
+/// Refuses models whose licence forbids uses unless it was accepted.
 fn check_licences(missing: &[&CatalogueEntry], accept: &[String]) -> Result<()> {
-    let open: Vec<_> = missing.iter().filter(|k| k.non_commercial && !accept.contains(&k.id)).collect();
+    let open: Vec<_> =
+        missing.iter().filter(|k| !accept.contains(&k.id)).filter_map(|k| Some((k, k.forbids()?))).collect();
     match open.first() {
         None => Ok(()),
-        Some(first) => Err(Error::input(format!(
-            "{}: {} forbids commercial use ({}); to fetch it all the same: {}",
+        Some((first, uses)) => Err(Error::input(format!(
+            "{}: {} forbids {uses} ({}); to fetch it all the same: {}",
             first.id,
             first.licence,
             first.source,
-            open.iter().map(|k| format!("--accept {}", k.id)).collect::<Vec<_>>().join(" ")
+            open.iter().map(|(k, _)| format!("--accept {}", k.id)).collect::<Vec<_>>().join(" ")
         ))),
     }
 }
@@ -118,11 +119,11 @@ fn size(entry: &CatalogueEntry) -> f64 {
 
 fn model_text(requested: &Requested, folder: &Path, client: &Client) -> String {
     let entry = requested.entry;
-    let state = match (&requested.present, entry.non_commercial) {
+    let state = match (&requested.present, entry.forbids()) {
         (Present::Sound, _) => "; is there".to_owned(),
         (Present::Changed(problem), _) => format!("; {problem}"),
-        (Present::Absent, true) => format!("; not for commercial use, needs --accept {}", entry.id),
-        (Present::Absent, false) => String::new(),
+        (Present::Absent, Some(uses)) => format!("; not for {uses}, needs --accept {}", entry.id),
+        (Present::Absent, None) => String::new(),
     };
     let to = folder.join(&entry.id);
     let mut text = format!(

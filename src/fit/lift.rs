@@ -10,7 +10,7 @@ use crate::pass::options::RasterOptions;
 use crate::pass::rasterizer::{Rasterizer, SplatBuffers};
 use crate::pass::view::View;
 use crate::progress::Progress;
-use crate::scene::{Camera, LevelField, RgbImage, Splats};
+use crate::scene::{Camera, Coverage, Image, LevelField, RgbImage, Splats};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -114,7 +114,7 @@ pub(super) struct Lifted {
     pub(super) weights: Vec<f32>,
 }
 
-/// Lifts the codes of all photos onto splats. Nothing but blending weights is rendered.
+/// Lifts the codes of all photos onto splats.
 pub(super) fn lift(
     device: &Device,
     cameras: &[Camera],
@@ -122,6 +122,69 @@ pub(super) fn lift(
     levels: &[&LevelField],
     progress: &dyn Progress,
 ) -> Result<Lifted> {
+    let labels = |view: usize| {
+        let pixels = cameras[view].width as usize * cameras[view].height as usize;
+        labels_of_view(levels, view, pixels)
+    };
+    let weights = label_weights(device, cameras, splats, labels, progress)?;
+    Ok(Lifted::new(&weights, splats.len(), levels))
+}
+
+/// Masks of one photo.
+#[derive(Clone, Copy)]
+pub struct PhotoMasks<'a> {
+    /// One per thing, each of the size of the camera.
+    pub masks: &'a [Image<bool>],
+    /// Used pixels; the others do not count. `None` = all.
+    pub coverage: Option<&'a Coverage>,
+}
+
+/// Lifts masks of photos onto splats, in closed form: per thing the share [N] of the blending weight
+/// of a splat that lies inside the masks, over all photos that show it; 0 for splats that none
+/// shows. `photos` has one entry per camera with equally many masks.
+pub fn lift_masks(
+    device: &Device,
+    cameras: &[Camera],
+    splats: &Splats,
+    photos: &[PhotoMasks],
+    progress: &dyn Progress,
+) -> Result<Vec<Vec<f32>>> {
+    let things = photos.first().map_or(0, |photo| photo.masks.len());
+    let weights = label_weights(device, cameras, splats, |view| mask_labels(&photos[view]), progress)?;
+    let share = |thing: usize, splat: usize| {
+        let of = |label: usize| {
+            let found = weights.of(splat).iter().find(|(known, _)| *known == label as i32);
+            found.map_or(0.0, |(_, weight)| *weight)
+        };
+        let (outside, inside) = (of(2 * thing), of(2 * thing + 1));
+        if outside + inside > MIN_WEIGHT { inside / (outside + inside) } else { 0.0 }
+    };
+    let shares = |thing| (0..splats.len()).into_par_iter().map(|splat| share(thing, splat)).collect();
+    Ok((0..things).map(shares).collect())
+}
+
+/// [things, H·W] labels of a photo: twice the number of the thing, and one more inside its mask.
+fn mask_labels(photo: &PhotoMasks) -> Result<Vec<i32>> {
+    let label = |thing: usize, pixel: usize, inside: bool| match photo.coverage {
+        Some(coverage) if !coverage.uses(pixel) => -1,
+        _ => 2 * thing as i32 + i32::from(inside),
+    };
+    let of_thing = |(thing, mask): (usize, &Image<bool>)| {
+        let pixels = mask.data.iter().enumerate();
+        pixels.map(|(pixel, inside)| label(thing, pixel, *inside)).collect::<Vec<i32>>()
+    };
+    Ok(photo.masks.iter().enumerate().flat_map(of_thing).collect())
+}
+
+/// Blending weights of the splats over the pixels of each label. `labels` returns those of a view,
+/// [levels, H·W]; −1 = none. Nothing but blending weights is rendered.
+fn label_weights(
+    device: &Device,
+    cameras: &[Camera],
+    splats: &Splats,
+    labels: impl Fn(usize) -> Result<Vec<i32>>,
+    progress: &dyn Progress,
+) -> Result<LabelWeights> {
     let params = SplatBuffers::upload(device, splats, &[], 0)?;
     let near = SceneScale::measure(cameras, &splats.means).near();
     // Colours are not rendered.
@@ -133,10 +196,9 @@ pub(super) fn lift(
         progress.check()?;
         raster.set_size(sizes[view])?;
         raster.set_view(&View::new(camera, near))?;
-        let labels = labels_of_view(levels, view, camera.width as usize * camera.height as usize)?;
-        raster.add_label_weights(&params, &options, &labels, &mut weights)?;
+        raster.add_label_weights(&params, &options, &labels(view)?, &mut weights)?;
     }
-    Ok(Lifted::new(&weights, splats.len(), levels))
+    Ok(weights)
 }
 
 /// [levels, H·W] labels of a view as rows of the common code table; −1 = none.

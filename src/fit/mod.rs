@@ -30,6 +30,7 @@ pub use densify::DensifyOptions;
 pub(crate) use language::Run as LanguageRun;
 pub(crate) use language::train_language_of;
 pub use language::{LanguagePoint, TrainedLanguage, decode_accuracy, train_language};
+pub use lift::{PhotoMasks, lift_masks};
 pub use losses::Losses;
 pub use options::{FeatureStorage, InitOptions, LanguageOptions, Rates, RgbOptions, Start};
 pub(crate) use photos::Photos;

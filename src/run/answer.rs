@@ -1,7 +1,9 @@
 //! The answer of a scene to one text: presence, instances with their positions, and the result in
 //! every view.
+use super::concepts::ConceptFindings;
 use super::view::DecodedFrame;
 use crate::Result;
+use crate::pass::RenderedFrame;
 use crate::query::frame::FrameSearch;
 use crate::query::highlight::{Highlight, highlight};
 use crate::query::instances::{Instance, Places, Visible};
@@ -58,6 +60,8 @@ pub struct Answers {
     pub highlight: Highlight,
     /// Whether every text has a mask ([`QueryOptions::published`]).
     pub published: bool,
+    /// Findings of the network that looked at the photos; `None` where the scene's language answers.
+    pub concepts: Option<ConceptFindings>,
 }
 
 impl Answers {
@@ -94,8 +98,8 @@ impl Answers {
     }
 
     /// Notes that the verdict does not contain.
-    fn remarks(&self) -> Vec<String> {
-        self.reading.notes()
+    pub fn remarks(&self) -> Vec<String> {
+        self.reading.notes().into_iter().chain(self.concepts.as_ref().map(ConceptFindings::note)).collect()
     }
 
     /// Record of the text and its instances, as in `query --json` and run.json; `views` are the
@@ -103,10 +107,14 @@ impl Answers {
     pub fn record(&self, views: &[String], world: &World) -> Value {
         let metres = world.scale.as_ref().map(|s| s.metres_per_unit);
         let instances: Vec<Value> = self.instances.iter().map(|i| instance_json(i, views, metres)).collect();
-        json!({
+        let mut record = json!({
             "text": self.text, "presence": self.presence, "p_value": self.p_value, "reliability": self.reliability,
             "phrasing": self.reading.phrasing, "vocabulary": self.reading.vocabulary, "instances": instances,
-        })
+        });
+        if let Some(concepts) = &self.concepts {
+            record["concepts"] = concepts.record();
+        }
+        record
     }
 }
 
@@ -146,6 +154,28 @@ pub fn verdict(presence: Option<Presence>, reading: &Reading, found: usize, view
         Some(Presence::Unsure) => format!("unsure; if it is here, in {found} of {views} photos"),
         Some(Presence::Found) | None => format!("found in {found} of {views} photos"),
     }
+}
+
+/// Things of a selection with their pixels in views, and the reliability of the parts that the views
+/// show.
+pub(super) fn things(
+    places: &Places,
+    selection: &Selection,
+    (cameras, frames): (&[Camera], &[&RenderedFrame]),
+) -> (Vec<Instance>, Vec<Option<f64>>) {
+    let pairs = cameras.par_iter().zip(frames);
+    let (visible, mut instances) = rayon::join(
+        || -> Vec<Visible> { pairs.map(|(c, f)| places.visible(&selection.splats, c, &f.depth)).collect() },
+        || match selection.found {
+            true => places.instances(&selection.splats, selection.level),
+            false => Vec::new(),
+        },
+    );
+    instances.par_iter_mut().for_each(|instance| {
+        instance.pixels = visible.iter().map(|v| places.pixel(instance, v)).collect();
+    });
+    let reliability = |v: &Visible| places.reliability(&v.splats(), selection.level);
+    (instances, visible.par_iter().map(reliability).collect())
 }
 
 impl Prepared {
@@ -200,24 +230,8 @@ impl Prepared {
         selection: &Selection,
         (cameras, frames): (&[Camera], &[DecodedFrame]),
     ) -> (Vec<Instance>, Vec<Option<f64>>) {
-        let pairs = cameras.par_iter().zip(frames);
-        let (visible, mut instances) = rayon::join(
-            || -> Vec<Visible> {
-                let view = |(c, f): (&Camera, &DecodedFrame)| {
-                    self.places.visible(&selection.splats, c, &f.rendered.depth)
-                };
-                pairs.map(view).collect()
-            },
-            || match selection.found {
-                true => self.places.instances(&selection.splats, selection.level),
-                false => Vec::new(),
-            },
-        );
-        instances.par_iter_mut().for_each(|instance| {
-            instance.pixels = visible.iter().map(|v| self.places.pixel(instance, v)).collect();
-        });
-        let reliability = |v: &Visible| self.places.reliability(&v.splats(), selection.level);
-        (instances, visible.par_iter().map(reliability).collect())
+        let rendered: Vec<&RenderedFrame> = frames.iter().map(|f| &f.rendered).collect();
+        things(&self.places, selection, (cameras, &rendered))
     }
 
     /// Answers a text in views, which need not be the scene's own. `search` has the maps of these
@@ -264,6 +278,7 @@ impl Prepared {
             instances,
             highlight,
             published: options.published,
+            concepts: None,
         })
     }
 }
@@ -273,7 +288,6 @@ mod tests {
     use super::*;
     use crate::infer::PresenceLevels;
     use crate::infer::things;
-    use crate::pass::RenderedFrame;
     use crate::query::CANONICAL_PHRASES;
     use crate::query::phrasing::{Phrasing, Vocabulary};
     use crate::query::presence::Alternatives;

@@ -5,6 +5,7 @@ pub mod base;
 mod border;
 pub mod budget;
 pub mod compat;
+pub mod concepts;
 pub mod config;
 pub mod encoder;
 mod execute;

@@ -322,22 +322,37 @@ pub fn seen(device: &Device, splats: &Splats, cameras: &[Camera], progress: &dyn
     Ok(Seen { pixels })
 }
 
+/// Renders a number per splat, blended per pixel.
+pub struct BlendedValues(Renderer);
+
+impl BlendedValues {
+    /// Uploads the scene with the values [N], in 0..1, as colours.
+    pub fn new(device: &Device, splats: &Splats, values: &[f32]) -> Result<BlendedValues> {
+        let sh = values.iter().flat_map(|v| [(v - 0.5) / SH_C0; 3]).collect();
+        let grey = Splats { sh, sh_degree: 0, ..splats.clone() };
+        Ok(BlendedValues(Renderer::new(device, &grey, &[], 0)?))
+    }
+
+    /// [H, W] `Σ w v` in [0, 1): not divided by alpha.
+    pub fn view(&mut self, camera: &Camera) -> Result<Image<f32>> {
+        let rgb = self.0.render(camera)?.rgb;
+        Ok(Image { width: rgb.width, height: rgb.height, data: rgb.data.iter().map(|c| c[0]).collect() })
+    }
+}
+
 /// Renders the blended share of unseen splats per pixel; alpha minus this share is shown by photos.
-pub struct UnseenShare(Renderer);
+pub struct UnseenShare(BlendedValues);
 
 impl UnseenShare {
     /// Uploads the scene with colour 1 for unseen splats and 0 for the others.
     pub fn new(device: &Device, splats: &Splats, seen: &Seen) -> Result<UnseenShare> {
-        let dc = |i: usize| (f32::from(u8::from(seen.is_unseen(i))) - 0.5) / SH_C0;
-        let sh = (0..splats.len()).flat_map(|i| [dc(i); 3]).collect();
-        let two = Splats { sh, sh_degree: 0, ..splats.clone() };
-        Ok(UnseenShare(Renderer::new(device, &two, &[], 0)?))
+        let values: Vec<f32> = (0..splats.len()).map(|i| f32::from(u8::from(seen.is_unseen(i)))).collect();
+        Ok(UnseenShare(BlendedValues::new(device, splats, &values)?))
     }
 
     /// [H, W] in [0, 1).
     pub fn view(&mut self, camera: &Camera) -> Result<Image<f32>> {
-        let rgb = self.0.render(camera)?.rgb;
-        Ok(Image { width: rgb.width, height: rgb.height, data: rgb.data.iter().map(|c| c[0]).collect() })
+        self.0.view(camera)
     }
 }
 

@@ -13,7 +13,7 @@ use super::runtime::Tensor;
 use crate::scene::MAX_SIDE;
 use crate::{Error, Result, files};
 
-const BUILT_IN: [(&str, &str); 15] = [
+const BUILT_IN: [(&str, &str); 16] = [
     ("clip", include_str!("adapters/clip.toml")),
     ("lseg", include_str!("adapters/lseg.toml")),
     ("siglip", include_str!("adapters/siglip.toml")),
@@ -29,6 +29,7 @@ const BUILT_IN: [(&str, &str); 15] = [
     ("roma2", include_str!("adapters/roma2.toml")),
     ("depth-anything", include_str!("adapters/depth-anything.toml")),
     ("metric-depth", include_str!("adapters/metric-depth.toml")),
+    ("sam3", include_str!("adapters/sam3.toml")),
 ];
 
 /// Preprocessing of a photo for a network.
@@ -458,7 +459,7 @@ impl GraphSpec {
         };
         let kind_fits = match port.kind {
             ElementType::Float => true,
-            ElementType::Integer => slot.integer,
+            ElementType::Integer | ElementType::Truth => slot.integer,
             ElementType::Other => false,
         };
         if !kind_fits {

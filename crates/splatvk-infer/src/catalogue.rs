@@ -21,6 +21,8 @@ pub enum Task {
     Text,
     /// Depth of each photo up to scale and shift.
     Depth,
+    /// Masks of all instances of a text.
+    Concepts,
 }
 
 impl Task {
@@ -33,6 +35,7 @@ impl Task {
             Task::Features => "features",
             Task::Text => "text",
             Task::Depth => "depth",
+            Task::Concepts => "concepts",
         }
     }
 }
@@ -51,7 +54,7 @@ pub struct CatalogueEntry {
     /// Its other tasks.
     #[serde(default, rename = "also")]
     pub other_tasks: Vec<Task>,
-    /// Its name in `--init`, `--matcher`, `--masks` or `--features`.
+    /// Its name in `--init`, `--matcher`, `--masks`, `--features` or `--concepts`.
     pub family: String,
     /// "paper", "open".
     pub packs: Vec<String>,
@@ -60,6 +63,8 @@ pub struct CatalogueEntry {
     /// The licence forbids commercial use.
     #[serde(default)]
     pub non_commercial: bool,
+    /// Uses that the licence forbids, if these are not the commercial ones.
+    pub forbidden: Option<String>,
     /// Size of its float32 files.
     pub megabytes: u32,
     /// Address of its project.
@@ -113,6 +118,11 @@ impl CatalogueEntry {
     /// checkpoint may also contain the state of training.
     pub fn ceiling(&self) -> u64 {
         u64::from(self.megabytes) * 2_000_000 + (64 << 20)
+    }
+
+    /// Uses that its licence forbids; such a model is fetched only where its licence was accepted.
+    pub fn forbids(&self) -> Option<&str> {
+        if self.non_commercial { Some("commercial use") } else { self.forbidden.as_deref() }
     }
 
     /// Whether `task` is its main task or one of the others.

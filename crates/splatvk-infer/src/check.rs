@@ -4,6 +4,7 @@ use std::path::Path;
 use std::time::Instant;
 
 use super::clip::Clip;
+use super::concepts::Concepts;
 use super::graph::GraphFile;
 use super::installed::{Installed, Task};
 use super::runtime::Input;
@@ -75,6 +76,7 @@ pub fn check(model: &Installed) -> Result<Vec<Measured>> {
             Task::Features => features(model, &photos[0].image, &mut steps)?,
             // Texts run with the features; depth comes from the geometry.
             Task::Text => {}
+            Task::Concepts => concepts(model, &photos[0].image, &mut steps)?,
             Task::Depth if model.tasks.contains(&Task::Geometry) => {}
             Task::Depth => {
                 measured("depth of 2 photos".to_string(), &mut steps, || {
@@ -174,6 +176,12 @@ fn features(model: &Installed, image: &RgbImage, steps: &mut Vec<Measured>) -> R
         return Err(Error::work(format!("model {}: a region without direction", model.name)));
     }
     measured("1 text".to_string(), steps, || net.embed_texts(&["a blue mug"])).map(drop)
+}
+
+/// Finds a text and the photo's masks with all three graphs.
+fn concepts(model: &Installed, image: &RgbImage, steps: &mut Vec<Measured>) -> Result<()> {
+    let mut net = Concepts::load(model.clone())?;
+    measured("1 text in 1 photo".to_string(), steps, || net.find(image, &["a blue mug"])).map(drop)
 }
 
 /// Two views of a textured wall and a nearer box, a step apart.

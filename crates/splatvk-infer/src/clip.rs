@@ -1,12 +1,8 @@
 //! CLIP (Radford et al. 2021; OpenCLIP): image regions and texts in one space, any embedding width.
 //! A model is an image tower or a network with a feature per pixel (LSeg), a text tower, and
 //! `tokenizer.json` beside it.
-use std::path::PathBuf;
-
 use rayon::prelude::*;
-use tokenizers::{ModelWrapper, Tokenizer};
 
-use super::adapter::TextSpec;
 use super::cache::OutputKey;
 use super::classify::{crop, extents};
 use super::contract::Part;
@@ -15,6 +11,7 @@ use super::installed::Installed;
 use super::prepare::prepare;
 use super::runtime::Input;
 use super::text::normalise;
+use super::tokens::Tokens;
 use super::{RegionEncoder, things};
 use crate::progress::{Progress, Silent};
 use crate::scene::{Image, RgbImage};
@@ -23,30 +20,11 @@ use crate::{Error, Result};
 /// Crops per forward pass: ViT-B/16 takes 0.2 GB for eight, and more are no faster on a CPU.
 const BATCH: usize = 8;
 
-/// Size of CLIP's vocabulary, and the ids that CLIP's tokenizer gives for some texts (open_clip
-/// 3.3, without start and end marks).
-const VOCABULARY: usize = 49408;
-const GOLDEN: [(&str, &[i64]); 12] = [
-    ("lemon", &[7184]),
-    ("a photo of a cat.", &[320, 1125, 539, 320, 2368, 269]),
-    ("Blue MUG", &[1746, 9722]),
-    ("café!", &[15304, 256]),
-    ("it's 3 o'clock", &[585, 568, 274, 334, 262, 6716]),
-    ("日本語", &[39121, 44353, 34002, 508]),
-    ("naïve — “quoted”", &[1097, 35689, 563, 2005, 257, 27706, 257]),
-    ("x²+y²=z²", &[343, 41175, 266, 344, 41175, 284, 345, 41175]),
-    ("🙂 smile", &[14860, 3490]),
-    ("&amp;amp; more", &[261, 750]),
-    ("hello   world\n\tfoo", &[3306, 1002, 23435]),
-    ("grandmother's vase, 1950s", &[17469, 568, 20431, 267, 272, 280, 276, 271, 338]),
-];
-
 /// The pair of towers. Each is loaded when first needed.
 pub struct Clip {
     model: Installed,
     space: String,
-    tokenizer: Tokenizer,
-    texts: TextSpec,
+    tokens: Tokens,
     image: Option<Graph>,
     text: Option<Graph>,
     dim: usize,
@@ -73,13 +51,11 @@ impl Clip {
         {
             return Err(towers_differ(&visual, &text, &format!("embeddings of {a} and {b} values")));
         }
-        let tokenizer = tokenizer(&model)?;
+        let tokens = Tokens::of(&model, Part::TextTower)?;
         // The weights define the space: features and texts of other weights are not comparable.
         let space =
             format!("{}:{}", model.family, OutputKey::new("space").model(&visual)?.model(&text)?.short());
-        let texts = text_spec(&tokenizer, &text)?;
-        let mut clip = Clip { model, space, tokenizer, texts, image: None, text: None, dim: 0 };
-        clip.check_tokens(&text)?;
+        let mut clip = Clip { model, space, tokens, image: None, text: None, dim: 0 };
         clip.dim = match widths.0.or(widths.1) {
             Some(dim) => dim,
             None => clip.embed_texts(&["a"])?.len(),
@@ -120,27 +96,6 @@ impl Clip {
         Err(towers_differ(visual, text, "a red, a green and a blue square are not nearest to their names"))
     }
 
-    /// Checks that a tokenizer with CLIP's vocabulary gives CLIP's ids; others are not checked.
-    fn check_tokens(&self, tower: &GraphFile) -> Result<()> {
-        if self.tokenizer.get_vocab_size(true) != VOCABULARY {
-            return Ok(());
-        }
-        for (text, wanted) in GOLDEN {
-            let ids = self.tokens(text)?;
-            if ids.len() < 2 || ids[1..ids.len() - 1] != *wanted {
-                return Err(Error::missing_model(
-                    tower.path.display(),
-                    format!(
-                        "{}: the tokenizer beside it does not give CLIP's tokens for {text:?} ({ids:?}); take tokenizer.json from \
-                     the model's own page or from tools/export/export_clip.py",
-                        tower.path.display()
-                    ),
-                ));
-            }
-        }
-        Ok(())
-    }
-
     fn visual(&mut self) -> Result<&mut Graph> {
         let graph = match self.image.take() {
             Some(graph) => graph,
@@ -154,23 +109,7 @@ impl Clip {
 
     /// Token ids of a text with its start and end marks, cut to the context with the end mark last.
     pub fn tokens(&self, text: &str) -> Result<Vec<i64>> {
-        let encoded = self
-            .tokenizer
-            .encode(prepared(text, &self.texts), true)
-            .map_err(|e| Error::input(format!("text {text:?}: {e}")))?;
-        let mut ids: Vec<i64> = encoded.get_ids().iter().map(|id| i64::from(*id)).collect();
-        let context = self.context();
-        if ids.len() > context {
-            let end = ids.last().copied().unwrap_or_default();
-            ids.truncate(context);
-            ids[context - 1] = end;
-        }
-        Ok(ids)
-    }
-
-    fn context(&self) -> usize {
-        let fixed = self.model.graph(Part::TextTower).ok().and_then(|g| g.fixed("tokens", "L"));
-        fixed.unwrap_or(self.texts.context).max(2)
+        self.tokens.ids(text)
     }
 
     /// Embeds every region from its own crop on black.
@@ -275,8 +214,7 @@ impl RegionEncoder for Clip {
     }
 
     fn embed_texts(&mut self, texts: &[&str]) -> Result<Vec<f32>> {
-        let context = self.context();
-        let tokens = texts.iter().map(|t| self.tokens(t)).collect::<Result<Vec<_>>>()?;
+        let padded = texts.iter().map(|t| self.tokens.padded(t)).collect::<Result<Vec<_>>>()?;
         let file = self.model.graph(Part::TextTower)?.clone();
         let graph = match self.text.take() {
             Some(graph) => graph,
@@ -286,12 +224,10 @@ impl RegionEncoder for Clip {
         let mut all = Vec::new();
         // One at a time: a text's embedding must not depend on its neighbours, and some exports fix
         // the batch at 1.
-        for ids in tokens {
-            let mask = (0..context).map(|k| i64::from(k < ids.len())).collect();
-            let mut ids = ids;
-            ids.resize(context, self.texts.pad);
-            let shape = || vec![1, context];
-            let inputs = vec![("tokens", Input::I64(shape(), ids)), ("mask", Input::I64(shape(), mask))];
+        for (ids, mask) in padded {
+            let shape = || vec![1, ids.len()];
+            let inputs =
+                vec![("tokens", Input::I64(shape(), ids.clone())), ("mask", Input::I64(shape(), mask))];
             let mut row = graph.run(inputs)?.take("embedding")?.data;
             normalise(&mut row);
             all.extend(row);
@@ -322,86 +258,6 @@ fn towers_differ(visual: &GraphFile, text: &GraphFile, why: &str) -> Error {
             text.path.display()
         ),
     )
-}
-
-fn tokenizer(model: &Installed) -> Result<Tokenizer> {
-    let text = model.graph(Part::TextTower)?;
-    let beside = text.path.with_file_name("tokenizer.json");
-    let places: [PathBuf; 2] = [beside, model.folder.join("tokenizer.json")];
-    let file = places.iter().find(|p| p.is_file()).ok_or_else(|| {
-        Error::missing_model(&model.name, format!(
-            "{}: missing; tools/export/export_clip.py writes it, and Hugging Face has one beside every CLIP model",
-            places[0].display()
-        ))
-    })?;
-    let failed = |e: tokenizers::Error| {
-        Error::missing_model(&model.name, format!("{}: not a tokenizer: {e}", file.display()))
-    };
-    let mut tokenizer = Tokenizer::from_file(file).map_err(failed)?;
-    tokenizer.with_padding(None);
-    tokenizer.with_truncation(None).map_err(failed)?;
-    Ok(tokenizer)
-}
-
-/// Preparation of texts for a tokenizer. Padding, case and end mark are part of a text for some
-/// towers, so that a tokenizer of no known family is refused.
-fn text_spec(tokenizer: &Tokenizer, tower: &GraphFile) -> Result<TextSpec> {
-    let vocabulary = tokenizer.get_vocab_size(true);
-    // A word per id leaves nothing to get wrong.
-    if matches!(tokenizer.get_model(), ModelWrapper::WordLevel(_)) {
-        return Ok(TextSpec { vocabulary, context: 77, pad: 0, end: 0, lower: false, punctuation: true });
-    }
-    let refuse = |reason: String| {
-        Err(Error::missing_model(tower.path.display(), format!("{}: {reason}", tower.path.display())))
-    };
-    let Some(spec) = tower.binding.texts.iter().find(|spec| spec.vocabulary == vocabulary) else {
-        let known: Vec<String> = tower.binding.texts.iter().map(|s| s.vocabulary.to_string()).collect();
-        return refuse(format!(
-            "the tokenizer beside it has {vocabulary} tokens, and a {} text tower one of {}: its padding and case are not \
-             known; state them as `texts` in adapter.toml (docs/use/models.md#adapters)",
-            tower.binding.family,
-            if known.is_empty() { "none that is known".to_owned() } else { known.join(" or ") }
-        ));
-    };
-    let last = tokenizer.encode(prepared("a", spec), true).ok().and_then(|e| e.get_ids().last().copied());
-    if last.map(i64::from) != Some(spec.end) {
-        return refuse(format!(
-            "the tokenizer beside it does not end a text with token {}, as the tower was trained; take tokenizer.json from the \
-             model's own page",
-            spec.end
-        ));
-    }
-    Ok(*spec)
-}
-
-/// A text as the tower was trained on it, for the tokenizer.
-fn prepared(text: &str, spec: &TextSpec) -> String {
-    let mut text = cleaned(text);
-    if spec.lower {
-        text = text.to_lowercase();
-    }
-    if !spec.punctuation {
-        text.retain(|c| !c.is_ascii_punctuation());
-        text = text.split_whitespace().collect::<Vec<_>>().join(" ");
-    }
-    text
-}
-
-/// Cleans a text as CLIP's tokenizer does before it splits words: straightens typographic quotes
-/// (as ftfy) and resolves HTML entities twice. The tokenizer file handles case and white space.
-fn cleaned(text: &str) -> String {
-    let entities =
-        [("&lt;", "<"), ("&gt;", ">"), ("&quot;", "\""), ("&#39;", "'"), ("&nbsp;", " "), ("&amp;", "&")];
-    let resolve = |text: String| entities.iter().fold(text, |t, (from, to)| t.replace(from, to));
-    resolve(resolve(text.chars().map(straight_quote).collect())).trim().to_string()
-}
-
-fn straight_quote(c: char) -> char {
-    match c {
-        '‘' | '’' | '‚' | '‛' => '\'',
-        '“' | '”' | '„' | '‟' => '"',
-        c => c,
-    }
 }
 
 #[cfg(test)]
@@ -465,19 +321,5 @@ mod tests {
         describe(2);
         let refused = load().err().unwrap().to_string();
         assert!(refused.contains("does not end a text with token 2"), "{refused}");
-    }
-
-    #[test]
-    fn texts_are_prepared_as_trained() {
-        let clip = TextSpec { vocabulary: 9, context: 77, pad: 0, end: 1, lower: false, punctuation: true };
-        let siglip = TextSpec { lower: true, punctuation: false, ..clip };
-        assert_eq!(prepared("It’s a Blue  mug.", &clip), "It's a Blue  mug.");
-        assert_eq!(prepared("It’s a Blue  mug.", &siglip), "its a blue mug");
-    }
-
-    #[test]
-    fn cleaned_text_matches_clip() {
-        let given = [" grandmother’s “vase” ", "&amp;amp; more", "a &lt;b&gt; c&#39;s"];
-        assert_eq!(given.map(cleaned), ["grandmother's \"vase\"", "& more", "a <b> c's"]);
     }
 }

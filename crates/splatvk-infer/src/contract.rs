@@ -33,6 +33,12 @@ pub enum Part {
     Warp,
     /// Image → depth of unknown scale and shift (Depth Anything, MiDaS).
     Depth,
+    /// Image → feature maps of a concept network (SAM 3).
+    ConceptImage,
+    /// Tokens → a feature per token (SAM 3).
+    ConceptText,
+    /// Feature maps and text → masks of all instances of the text (SAM 3).
+    ConceptDecoder,
 }
 
 impl Part {
@@ -55,6 +61,9 @@ impl Part {
             Part::MultiView => &MULTI_VIEW,
             Part::Warp => &WARP,
             Part::Depth => &DEPTH,
+            Part::ConceptImage => &CONCEPT_IMAGE,
+            Part::ConceptText => &CONCEPT_TEXT,
+            Part::ConceptDecoder => &CONCEPT_DECODER,
         }
     }
 }
@@ -70,7 +79,7 @@ pub struct Slot {
     pub layouts: &'static [&'static str],
     /// Whether a graph may lack it.
     pub optional: bool,
-    /// Whether it may be of integers.
+    /// Whether it may be of integers or truth values.
     pub integer: bool,
 }
 
@@ -217,8 +226,40 @@ static DEPTH: Contract = Contract {
     ],
 };
 
+/// Feature maps that a concept decoder needs, finest first.
+macro_rules! concept_levels {
+    ($($more:expr),*) => {
+        &[
+            slot("level0", "B C0 h0 w0", &[]),
+            slot("level1", "B C1 h1 w1", &[]),
+            slot("level2", "B C2 h2 w2", &[]),
+            slot("position2", "B C2 h2 w2", &[]),
+            $($more),*
+        ]
+    };
+}
+static CONCEPT_IMAGE: Contract = Contract {
+    name: "concept-image",
+    inputs: &[slot("image", "B 3 H W", &["B H W 3"])],
+    outputs: concept_levels!(),
+};
+static CONCEPT_TEXT: Contract = Contract {
+    name: "concept-text",
+    inputs: &[integer(slot("tokens", "B L", &[])), integer(maybe("mask", "B L", &[]))],
+    outputs: &[slot("text", "B L E", &[]), integer(maybe("text_mask", "B L", &[]))],
+};
+static CONCEPT_DECODER: Contract = Contract {
+    name: "concept-decoder",
+    inputs: concept_levels!(slot("text", "B L E", &[]), integer(slot("text_mask", "B L", &[]))),
+    outputs: &[
+        slot("masks", "B Q x y", &[]),
+        slot("scores", "B Q", &["B Q 1"]),
+        maybe("presence", "B", &["B 1"]),
+    ],
+};
+
 /// Every part.
-pub const PARTS: [Part; 11] = [
+pub const PARTS: [Part; 14] = [
     Part::ImageTower,
     Part::TextTower,
     Part::DenseFeatures,
@@ -230,6 +271,9 @@ pub const PARTS: [Part; 11] = [
     Part::MultiView,
     Part::Warp,
     Part::Depth,
+    Part::ConceptImage,
+    Part::ConceptText,
+    Part::ConceptDecoder,
 ];
 
 /// The axes of a shape.

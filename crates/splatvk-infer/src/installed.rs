@@ -102,7 +102,7 @@ impl Inventory {
 }
 
 /// Sets of parts that form a model, and its tasks.
-const WHOLE: [(&[Part], &[Task]); 8] = [
+const WHOLE: [(&[Part], &[Task]); 9] = [
     (&[Part::Pair], &[Task::Geometry, Task::Depth]),
     (&[Part::PairEncoder, Part::PairDecoder], &[Task::Geometry, Task::Depth]),
     (&[Part::MultiView], &[Task::Geometry, Task::Depth]),
@@ -111,6 +111,7 @@ const WHOLE: [(&[Part], &[Task]); 8] = [
     (&[Part::MaskEncoder, Part::MaskDecoder], &[Task::Masks]),
     (&[Part::ImageTower, Part::TextTower], &[Task::Features, Task::Text]),
     (&[Part::DenseFeatures, Part::TextTower], &[Task::Features, Task::Text]),
+    (&[Part::ConceptImage, Part::ConceptText, Part::ConceptDecoder], &[Task::Concepts]),
 ];
 
 /// Recognises every `.onnx` file in the folders of `registry` and one folder below.
@@ -239,7 +240,10 @@ fn how_to_get(name: &str, task: Task, place: &str) -> String {
     };
     let fetch = match k.files.is_empty() && k.recipe.is_none() {
         true => String::new(),
-        false => format!("splatvk models fetch {} gets it ({}, from {}), or ", k.id, k.licence, k.source),
+        false => {
+            let accept = k.forbids().map_or(String::new(), |_| format!(" --accept {}", k.id));
+            format!("splatvk models fetch {}{accept} gets it ({}, from {}), or ", k.id, k.licence, k.source)
+        }
     };
     format!(
         "{fetch}put its ONNX files into {place}/{name}/ ({} writes them); see splatvk models list",

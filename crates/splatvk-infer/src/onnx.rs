@@ -18,7 +18,9 @@ pub enum ElementType {
     Float,
     /// 32- or 64-bit integers.
     Integer,
-    /// Anything else (bool, string, 8-bit, bfloat16, not a tensor).
+    /// Truth values.
+    Truth,
+    /// Anything else (string, 8-bit, bfloat16, not a tensor).
     Other,
 }
 
@@ -197,6 +199,7 @@ impl Reader {
                     port.kind = match n {
                         1 | 10 | 11 => ElementType::Float,
                         6 | 7 => ElementType::Integer,
+                        9 => ElementType::Truth,
                         _ => ElementType::Other,
                     }
                 }

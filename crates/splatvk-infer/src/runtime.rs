@@ -19,7 +19,8 @@ pub struct Tensor {
     pub data: Vec<f32>,
 }
 
-/// Input of a session. Floats and integers are converted to the element type of the graph.
+/// Input of a session. Floats and integers are converted to the element type of the graph; of truth
+/// values 0 is false.
 #[derive(Clone)]
 #[non_exhaustive]
 pub enum Input {
@@ -61,6 +62,10 @@ impl Input {
             }
             (Input::I64(shape, data), Some(T::Float16 | T::Float32 | T::Float64)) => {
                 float_value(shape, data.into_iter().map(|v| v as f32).collect(), wanted)
+            }
+            (Input::I64(shape, data), Some(T::Bool)) => {
+                let truth: Vec<bool> = data.into_iter().map(|v| v != 0).collect();
+                Ok(OrtTensor::from_array((shape, truth))?.into())
             }
             (Input::I64(shape, data), _) => Ok(OrtTensor::from_array((shape, data))?.into()),
         }
@@ -183,6 +188,10 @@ fn to_floats(value: &ort::value::DynValue) -> ort::Result<Tensor> {
         Some(T::Int64) => {
             let (shape, data) = value.try_extract_tensor::<i64>()?;
             Tensor { shape: lengths(shape), data: data.iter().map(|v| *v as f32).collect() }
+        }
+        Some(T::Bool) => {
+            let (shape, data) = value.try_extract_tensor::<bool>()?;
+            Tensor { shape: lengths(shape), data: data.iter().map(|v| f32::from(u8::from(*v))).collect() }
         }
         _ => {
             let (shape, data) = value.try_extract_tensor::<f32>()?;

@@ -3,6 +3,7 @@ use std::path::Path;
 
 pub const FLOAT: u64 = 1;
 pub const INT64: u64 = 7;
+pub const BOOL: u64 = 9;
 
 /// A graph under construction. Axes are numbers or names ("?" = any).
 #[derive(Default)]
@@ -57,8 +58,13 @@ impl Onnx {
         self
     }
 
-    pub fn output(mut self, name: &str, dims: &str) -> Onnx {
-        self.graph.extend(bytes(12, &port(name, FLOAT, dims)));
+    pub fn output(self, name: &str, dims: &str) -> Onnx {
+        self.output_of(name, FLOAT, dims)
+    }
+
+    /// An output of another element type than floats.
+    pub fn output_of(mut self, name: &str, kind: u64, dims: &str) -> Onnx {
+        self.graph.extend(bytes(12, &port(name, kind, dims)));
         self
     }
 

@@ -1,6 +1,6 @@
 //! The answer to a query in one frame, with its images.
 use super::maps::{CodeMaps, LevelMap};
-use super::window::{AREA, Part, Table, blended, box_rows};
+use super::window::{AREA, Part, Table, blended, box_rows, whole};
 use crate::scene::Image;
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -24,6 +24,34 @@ pub struct QueryResult {
 }
 
 impl QueryResult {
+    /// The answer of a value in 0..1 per pixel. The mask are the pixels with at least `bar`, the
+    /// location is the maximum of the blended values (docs/internals/method.md#smoothing).
+    pub fn of_values(values: Image<f32>, bar: f32) -> QueryResult {
+        let (width, height) = (values.width, values.height);
+        let mask = Image { width, height, data: values.data.iter().map(|v| *v >= bar).collect() };
+        let mut best = (0, (0, 0));
+        if width > 0 {
+            let fill = |y: usize, x: usize, row: &mut [u32]| {
+                row.iter_mut().zip(&values.data[y * width + x..]).for_each(|(out, v)| *out = whole(*v));
+            };
+            box_rows((width, height), &Part { x: 0..width, y: 0..height }, fill, |y, x, row, sums| {
+                for (k, (v, s)) in row.iter().zip(sums).enumerate() {
+                    let sum = AREA * v + s;
+                    if sum > best.0 {
+                        best = (sum, (x + k, y));
+                    }
+                }
+            });
+        }
+        QueryResult {
+            level: 0,
+            location: best.1,
+            score: values.data.iter().copied().fold(0.0, f32::max),
+            found: mask.data.contains(&true),
+            images: AnswerImages { values: Some(Arc::new(values)), ..AnswerImages::of_mask(mask) },
+        }
+    }
+
     /// Marks the text as not found and clears the mask; relevancy still shows the nearest codes.
     pub fn mark_not_found(&mut self) {
         self.found = false;
@@ -55,6 +83,8 @@ pub struct AnswerImages {
     level: usize,
     /// Relevancy of the codes of the level.
     table: Table,
+    /// Given relevancy, which needs no codes.
+    values: Option<Arc<Image<f32>>>,
     pub(super) mask: Mask,
 }
 
@@ -72,7 +102,7 @@ pub(super) enum Mask {
 
 impl AnswerImages {
     pub(super) fn new(maps: &Arc<CodeMaps>, level: usize, table: &Table, mask: Mask) -> AnswerImages {
-        AnswerImages { maps: maps.clone(), level, table: table.clone(), mask }
+        AnswerImages { maps: maps.clone(), level, table: table.clone(), values: None, mask }
     }
 
     /// Images with a given mask and no relevancy.
@@ -95,6 +125,9 @@ impl AnswerImages {
     }
 
     pub(super) fn relevancy(&self) -> Image<f32> {
+        if let Some(values) = &self.values {
+            return values.as_ref().clone();
+        }
         let (width, height) = (self.maps.width, self.maps.height);
         let mut image = Image::filled(width, height, 0.0);
         let Some(map) = self.map().filter(|_| width > 0) else { return image };
@@ -140,5 +173,29 @@ impl AnswerImages {
             }
             Mask::Image(image) => image.data.iter().filter(|m| **m).count(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_values_masks_and_locates() {
+        // A square of 20 pixels around (70, 30), and a brighter pixel far from it.
+        let value = |x: usize, y: usize| match (x.abs_diff(70) <= 10 && y.abs_diff(30) <= 10, (x, y)) {
+            (true, _) => 0.6,
+            (_, (5, 5)) => 0.9,
+            _ => 0.2,
+        };
+        let data = (0..100 * 60).map(|p| value(p % 100, p / 100)).collect();
+        let values = Image { width: 100, height: 60, data };
+        let answer = QueryResult::of_values(values.clone(), 0.5);
+        assert_eq!((answer.found, answer.score, answer.mask_pixels()), (true, 0.9, 21 * 21 + 1));
+        let (x, y) = answer.location;
+        assert!(x.abs_diff(70) <= 6 && y.abs_diff(30) <= 6, "{x} {y}");
+        assert_eq!(answer.relevancy(), values);
+        let nothing = QueryResult::of_values(values, 0.95);
+        assert!(!nothing.found && nothing.mask_pixels() == 0);
     }
 }
