@@ -172,6 +172,9 @@ fn report_text(report: &Report, entry: &CatalogueEntry) -> String {
     }
     for step in &report.steps {
         let _ = writeln!(text, "    {}: {:.2} s", step.step, step.seconds);
+        if let Some(warning) = &step.warning {
+            let _ = writeln!(text, "    warning: {warning}");
+        }
     }
     text
 }

@@ -174,7 +174,7 @@ fn check_all(registry: &Registry, as_json: bool) -> Result<()> {
     }
 }
 
-/// Seconds, memory and error of a model's steps.
+/// Seconds, memory, error and figures of a model's steps, and their warnings.
 pub fn check_text(model: &Installed, steps: Option<&[Measured]>) -> String {
     let state = if steps.is_some() { "sound" } else { "NOT USABLE" };
     let untrained = if model.untrained() { " (untrained weights)" } else { "" };
@@ -182,10 +182,21 @@ pub fn check_text(model: &Installed, steps: Option<&[Measured]>) -> String {
     for s in steps.unwrap_or_default() {
         let error = s.error.map(|e| format!("  relative error {e:.1e}")).unwrap_or_default();
         let memory = s.peak_memory as f64 / 1e9;
-        let _ = writeln!(text, "  {:<44} {:8.2} s {memory:6.2} GB{error}", s.step, s.seconds);
+        let figures: Vec<String> =
+            s.figures.iter().map(|f| format!("{} {:.3}{}{}", f.name, f.value, gap(f.unit), f.unit)).collect();
+        let figures = if figures.is_empty() { String::new() } else { format!("  {}", figures.join(", ")) };
+        let _ = writeln!(text, "  {:<44} {:8.2} s {memory:6.2} GB{error}{figures}", s.step, s.seconds);
+        if let Some(warning) = &s.warning {
+            let _ = writeln!(text, "    warning: {warning}");
+        }
     }
     write_unused(&mut text, model);
     text
+}
+
+/// Space before a unit; degrees have none.
+fn gap(unit: &str) -> &'static str {
+    if unit.is_empty() || unit == "°" { "" } else { " " }
 }
 
 /// JSON of a built-in model for `models list --json`, `doctor --json` and `run.json`.

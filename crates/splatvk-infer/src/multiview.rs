@@ -4,13 +4,31 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 
 use super::best_pairs::BestPairs;
 use super::cache::OutputKey;
-use super::graph::{GraphFile, Outputs};
+use super::graph::{Graph, GraphFile, Outputs};
 use super::prepare::Prepared;
 use super::runtime::Input;
 use crate::photo::Photo;
 use crate::progress::Progress;
 use crate::scene::{Camera, PairPointmaps, Pointmap, Pointmaps, Pose};
 use crate::{Error, Result};
+
+/// What a network gives for a list of photos.
+pub(super) struct Estimate {
+    /// One per photo, at the size of the input; world and unit are the network's.
+    pub cameras: Vec<Camera>,
+    /// [N, H, W] camera z.
+    pub depth: Vec<f32>,
+    /// [N, H, W] on the network's own scale.
+    pub confidence: Vec<f32>,
+}
+
+impl Estimate {
+    /// Depth of one photo, [H, W].
+    pub fn depth_of(&self, view: usize) -> &[f32] {
+        let pixels = self.depth.len() / self.cameras.len().max(1);
+        &self.depth[view * pixels..(view + 1) * pixels]
+    }
+}
 
 pub(super) fn pointmaps(graph: &GraphFile, photos: &[Photo], progress: &dyn Progress) -> Result<Pointmaps> {
     let count = photos.len();
@@ -29,25 +47,12 @@ pub(super) fn pointmaps(graph: &GraphFile, photos: &[Photo], progress: &dyn Prog
         key = key.values(&p.data);
     }
     let pixels = width * height;
-    let values = graph.compute.remember(key, || {
-        let data = prepared.iter().flat_map(|p| p.data.iter().copied()).collect();
-        let mut outputs =
-            graph.load()?.run(vec![("images", Input::F32(vec![1, count, 3, height, width], data))])?;
-        let mut all = cameras(&mut outputs, graph, count, (width, height))?;
-        all.extend(outputs.take("depth")?.data);
-        all.extend(outputs.take("confidence")?.data);
-        Ok(all)
-    })?;
-    let (cameras, maps) = values.split_at_checked(16 * count).unwrap_or_default();
-    let cameras: Vec<Camera> =
-        cameras.chunks_exact(16).zip(&views).map(|(c, v)| camera(c, &v.name, width, height)).collect();
-    let (depth, confidence) = maps.split_at_checked(pixels * count).unwrap_or_default();
-    if confidence.len() != pixels * count || cameras.len() != count {
-        return Err(Error::work(format!(
-            "{}: its depth does not have the size of its input",
-            graph.path.display()
-        )));
+    let values = graph.compute.remember(key, || forward(&mut graph.load()?, &prepared))?;
+    let mut found = estimate(graph, &prepared, &values)?;
+    for (camera, view) in found.cameras.iter_mut().zip(&views) {
+        camera.name.clone_from(&view.name);
     }
+    let Estimate { cameras, depth, confidence } = found;
     let worlds: Vec<Vec<DVec3>> = cameras
         .iter()
         .zip(depth.chunks_exact(pixels))
@@ -84,8 +89,37 @@ pub(super) fn pointmaps(graph: &GraphFile, photos: &[Photo], progress: &dyn Prog
     Ok(Pointmaps { views, pairs, cameras, confidence_floor })
 }
 
+/// Runs the network on a list of photos: 16 values per camera, then all depth, then all confidence.
+pub(super) fn forward(graph: &mut Graph, prepared: &[Prepared]) -> Result<Vec<f32>> {
+    let count = prepared.len();
+    let (width, height) = prepared.first().map_or((0, 0), |p| (p.width, p.height));
+    let data = prepared.iter().flat_map(|p| p.data.iter().copied()).collect();
+    let mut outputs = graph.run(vec![("images", Input::F32(vec![1, count, 3, height, width], data))])?;
+    let mut all = cameras(&mut outputs, &graph.file, count, (width, height))?;
+    all.extend(outputs.take("depth")?.data);
+    all.extend(outputs.take("confidence")?.data);
+    Ok(all)
+}
+
+/// Splits the values of [`forward`].
+pub(super) fn estimate(graph: &GraphFile, prepared: &[Prepared], values: &[f32]) -> Result<Estimate> {
+    let count = prepared.len();
+    let (width, height) = prepared.first().map_or((0, 0), |p| (p.width, p.height));
+    let pixels = width * height;
+    let (cameras, maps) = values.split_at_checked(16 * count).unwrap_or_default();
+    let cameras: Vec<Camera> = cameras.chunks_exact(16).map(|c| camera(c, width, height)).collect();
+    let (depth, confidence) = maps.split_at_checked(pixels * count).unwrap_or_default();
+    if confidence.len() != pixels * count || cameras.len() != count {
+        return Err(Error::work(format!(
+            "{}: its depth does not have the size of its input",
+            graph.path.display()
+        )));
+    }
+    Ok(Estimate { cameras, depth: depth.to_vec(), confidence: confidence.to_vec() })
+}
+
 /// Preprocesses all photos; sizes must be equal, since they share a tensor.
-fn same_size(graph: &GraphFile, photos: &[Photo]) -> Result<Vec<Prepared>> {
+pub(super) fn same_size(graph: &GraphFile, photos: &[Photo]) -> Result<Vec<Prepared>> {
     let mut prepared = super::prepare::inputs(graph, "images", photos)?;
     let Some((width, height)) = prepared.first().map(|p| (p.width, p.height)) else { return Ok(prepared) };
     for (ready, photo) in prepared.iter_mut().zip(photos) {
@@ -131,7 +165,7 @@ fn cameras(outputs: &mut Outputs, graph: &GraphFile, count: usize, size: (usize,
     Ok(all)
 }
 
-fn camera(c: &[f32], name: &str, width: usize, height: usize) -> Camera {
+fn camera(c: &[f32], width: usize, height: usize) -> Camera {
     let v = |k: usize| f64::from(c[k]);
     let rows = DMat3::from_cols(
         DVec3::new(v(0), v(1), v(2)),
@@ -140,7 +174,7 @@ fn camera(c: &[f32], name: &str, width: usize, height: usize) -> Camera {
     );
     let pose = Pose { rotation: rows.transpose(), translation: DVec3::new(v(9), v(10), v(11)) };
     Camera {
-        name: name.into(),
+        name: String::new(),
         width: width as u32,
         height: height as u32,
         fx: v(12),

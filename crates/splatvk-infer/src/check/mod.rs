@@ -1,17 +1,25 @@
 //! Runs an installed network on built-in images, checks it against its contract, and measures time
 //! and memory.
+mod parallax;
+mod pictures;
+#[cfg(test)]
+mod tests;
+mod views;
+
 use std::path::Path;
 use std::time::Instant;
 
+use glam::DMat3;
+
 use super::clip::Clip;
 use super::concepts::Concepts;
+use super::contract::Part;
 use super::graph::GraphFile;
 use super::installed::{Installed, Task};
 use super::runtime::Input;
 use super::sam::{BATCH, MASKS, Sam};
-use super::{RegionEncoder, depth_prior, pairs, warp};
+use super::{RegionEncoder, depth_prior};
 use crate::format::npy::{self, NpyData};
-use crate::photo::{self, Photo};
 use crate::progress::{Silent, peak_memory, reset_peak_memory};
 use crate::scene::{Image, RgbImage};
 use crate::{Error, Result};
@@ -29,8 +37,44 @@ pub struct Measured {
     pub seconds: f64,
     /// Peak resident memory of the process during the step, bytes; 0 if unknown.
     pub peak_memory: u64,
-    /// Largest difference to PyTorch's answer, relative to its largest value.
+    /// Largest difference to the answer that the step repeats, relative to its largest value:
+    /// PyTorch's, or the graph's own to the same photos in another order.
     pub error: Option<f32>,
+    /// Other figures of the step.
+    pub figures: Vec<Figure>,
+    /// Reason for doubt in a network that otherwise works, one line.
+    pub warning: Option<String>,
+}
+
+/// A figure of one step.
+#[derive(Clone, Debug, PartialEq, serde::Serialize)]
+pub struct Figure {
+    /// Its name.
+    pub name: &'static str,
+    /// NaN where nothing could be measured.
+    pub value: f64,
+    /// "°", "%", "px", "extents" (of the cameras), or "" for a ratio.
+    pub unit: &'static str,
+}
+
+impl Figure {
+    fn new(name: &'static str, value: f64, unit: &'static str) -> Figure {
+        Figure { name, value, unit }
+    }
+}
+
+/// Figures with the conclusion from them.
+struct Finding {
+    figures: Vec<Figure>,
+    verdict: Verdict,
+}
+
+enum Verdict {
+    Sound,
+    /// A right network may give this.
+    Doubt(String),
+    /// No right network gives this.
+    Fault(String),
 }
 
 fn measured<T>(step: String, steps: &mut Vec<Measured>, work: impl FnOnce() -> Result<T>) -> Result<T> {
@@ -38,7 +82,8 @@ fn measured<T>(step: String, steps: &mut Vec<Measured>, work: impl FnOnce() -> R
     let began = Instant::now();
     let done = work()?;
     let seconds = began.elapsed().as_secs_f64();
-    steps.push(Measured { step, seconds, peak_memory: peak_memory(), error: None });
+    let peak_memory = peak_memory();
+    steps.push(Measured { step, seconds, peak_memory, error: None, figures: Vec::new(), warning: None });
     Ok(done)
 }
 
@@ -57,21 +102,14 @@ pub fn check(model: &Installed) -> Result<Vec<Measured>> {
             }
         }
     }
-    let photos = pictures();
+    let photos = pictures::pictures(2);
     for task in &model.tasks {
         match task {
-            Task::Geometry => {
-                // Multi-view networks may have a fixed number of photos.
-                let count = model.graphs.values().find_map(|g| g.fixed("images", "N")).unwrap_or(2);
-                let some: Vec<Photo> = photos.iter().cycle().take(count).cloned().collect();
-                measured(format!("geometry of {count} photos"), &mut steps, || {
-                    pairs::pointmaps(model, &some, &Silent)
-                })?;
-            }
-            Task::Matcher => {
-                let step = "matches of a pair, both ways".to_string();
-                measured(step, &mut steps, || warp::warps(model, &photos, &Silent))?;
-            }
+            Task::Geometry => match model.graph(Part::MultiView) {
+                Ok(graph) => views::check(model, graph, &mut steps)?,
+                Err(_) => parallax::of_pair_network(model, &mut steps)?,
+            },
+            Task::Matcher => parallax::of_matcher(model, &mut steps)?,
             Task::Masks => masks(model, &photos[0].image, &mut steps)?,
             Task::Features => features(model, &photos[0].image, &mut steps)?,
             // Texts run with the features; depth comes from the geometry.
@@ -86,6 +124,38 @@ pub fn check(model: &Installed) -> Result<Vec<Measured>> {
         }
     }
     Ok(steps)
+}
+
+/// Adds a finding to the last step. Outputs of untrained networks mean nothing, so there is no
+/// verdict on them.
+fn record(model: &Installed, steps: &mut [Measured], finding: Finding) -> Result<()> {
+    let Some(last) = steps.last_mut() else { return Ok(()) };
+    last.figures.extend(finding.figures);
+    match finding.verdict {
+        _ if model.untrained() => Ok(()),
+        Verdict::Sound => Ok(()),
+        Verdict::Doubt(reason) => {
+            last.warning = Some(reason);
+            Ok(())
+        }
+        Verdict::Fault(fault) => Err(refuse(model, &fault)),
+    }
+}
+
+/// The error for a network with a fault.
+fn refuse(model: &Installed, fault: &str) -> Error {
+    let export = match model.catalogue_entry().map(|k| k.export.as_str()) {
+        Some(script) if script.ends_with(".py") => script,
+        _ => "a script of tools/export",
+    };
+    let (folder, name) = (model.folder.display(), &model.name);
+    Error::missing_model(name, format!("{folder}: model {name}: {fault}; export it again with {export}"))
+}
+
+/// Angle between two rotations, degrees: 2 asin(‖A − B‖ / √8), which is exact for small angles too.
+fn rotation_degrees(a: &DMat3, b: &DMat3) -> f64 {
+    let squares: f64 = (*a - *b).to_cols_array().iter().map(|v| v * v).sum();
+    2.0 * (squares / 8.0).sqrt().min(1.0).asin().to_degrees()
 }
 
 /// The largest relative difference between the graph's outputs and the reference beside it.
@@ -182,28 +252,4 @@ fn features(model: &Installed, image: &RgbImage, steps: &mut Vec<Measured>) -> R
 fn concepts(model: &Installed, image: &RgbImage, steps: &mut Vec<Measured>) -> Result<()> {
     let mut net = Concepts::load(model.clone())?;
     measured("1 text in 1 photo".to_string(), steps, || net.find(image, &["a blue mug"])).map(drop)
-}
-
-/// Two views of a textured wall and a nearer box, a step apart.
-fn pictures() -> Vec<Photo> {
-    (0..2).map(picture).collect()
-}
-
-fn picture(k: usize) -> Photo {
-    let (width, height) = (640usize, 480usize);
-    // The wall moves by 20 pixels, the box before it by 60.
-    let pixel = |p: usize| {
-        let (x, y) = ((p % width) as f64, (p / width) as f64);
-        let near = x + 60.0 * k as f64;
-        let inside = (260.0..420.0).contains(&near) && (160.0..330.0).contains(&y);
-        if inside { texture(near, y, 3.0) } else { texture(x + 20.0 * k as f64, y, 1.0) }
-    };
-    let image = RgbImage { width, height, data: (0..width * height).map(pixel).collect() };
-    photo::of_image(format!("built-in {k}").as_ref(), image)
-}
-
-/// Smooth pseudo-random colour.
-fn texture(x: f64, y: f64, seed: f64) -> [f32; 3] {
-    let wave = |a: f64, b: f64| 0.5 + 0.5 * ((x * a + seed).sin() * (y * b - seed).cos());
-    [wave(0.11, 0.07) as f32, wave(0.05, 0.13) as f32, wave(0.23, 0.19) as f32]
 }
