@@ -1,4 +1,4 @@
-//! The open pack at its real sizes: graphs with the interfaces of the public files, padded with
+//! The public files of the open pack at their real sizes: graphs with their interfaces, padded with
 //! unused weights.
 use super::models::siglip_graphs;
 use super::server::{File, Server, plain};
@@ -10,9 +10,7 @@ use splatvk::progress::Silent;
 use splatvk_test_support::onnx::{FLOAT, INT64, Onnx};
 use std::collections::HashMap;
 
-/// Bytes of the weights without a size in the catalogue: 393.0 MiB.
-const DA3_WEIGHTS: u64 = 412_090_368;
-/// About the bytes of SigLIP 2's text tower, which has no size there either.
+/// About the bytes of SigLIP 2's text tower, which has no size in the catalogue.
 const SIGLIP_TEXT: u64 = 1_129_000_000;
 
 /// Incompressible numbers, as in weights.
@@ -51,25 +49,6 @@ fn saying(mut graph: Onnx, outputs: &[(&str, &str, f32)]) -> Onnx {
     graph
 }
 
-fn da3() -> Onnx {
-    let graph = Onnx::new().input("pixel_values", FLOAT, "1 2 3 28 28").external(
-        "unused",
-        &[DA3_WEIGHTS / 4],
-        "model.onnx_data",
-    );
-    let graph = saying(graph, &[("predicted_depth", "1 2 28 28", 2.0), ("confidence", "1 2 28 28", 5.0)]);
-    let pose = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0];
-    let graph = two_matrices("extrinsics", "1 2 3 4", &[1, 2, 3, 4], &pose, graph);
-    let camera = [30.0, 0.0, 14.0, 0.0, 30.0, 14.0, 0.0, 0.0, 1.0];
-    two_matrices("intrinsics", "1 2 3 3", &[1, 2, 3, 3], &camera, graph)
-}
-
-/// Adds an output with a matrix for each of two photos.
-fn two_matrices(name: &str, shape: &str, dims: &[u64], one: &[f32], graph: Onnx) -> Onnx {
-    let kept = format!("the_{name}");
-    graph.output(name, shape).weight(&kept, dims, &one.repeat(2)).node("Identity", &kept, name, &[])
-}
-
 fn sam_encoder(weights: u64) -> Onnx {
     let graph = Onnx::new().input("pixel_values", FLOAT, "1 3 1024 1024").external(
         "unused",
@@ -96,17 +75,20 @@ fn sam_decoder(weights: u64) -> Onnx {
     saying(graph, &[("pred_masks", "1 1 3 8 8", 1.0), ("iou_scores", "1 1 3", 0.9)])
 }
 
+/// Models of the pack that are not exported.
+fn public() -> impl Iterator<Item = &'static CatalogueEntry> {
+    catalogue().iter().filter(|k| k.packs.contains(&"open".into()) && !k.files.is_empty())
+}
+
 /// Response of the server for each file of the pack.
 fn bodies() -> HashMap<String, Vec<u8>> {
     let mut all = HashMap::new();
-    for entry in catalogue().iter().filter(|k| k.packs.contains(&"open".into())) {
+    for entry in public() {
         let sizes: HashMap<&str, u64> =
             entry.files.iter().map(|s| (s.name.as_str(), s.bytes.unwrap_or(SIGLIP_TEXT))).collect();
         for source in &entry.files {
             let size = sizes[source.name.as_str()];
             let body = match (entry.task, source.name.as_str()) {
-                (Task::Geometry, "model.onnx") => da3().encode(),
-                (Task::Geometry, _) => weights(DA3_WEIGHTS),
                 (Task::Masks, "vision_encoder.onnx") => {
                     sam_encoder(sizes["vision_encoder.onnx_data"]).encode()
                 }
@@ -131,7 +113,7 @@ fn as_served(entry: &CatalogueEntry) -> CatalogueEntry {
 }
 
 #[test]
-#[ignore = "2.1 GB; prints the figures of docs/use/models.md"]
+#[ignore = "1.7 GB; prints the figures of docs/use/models.md"]
 fn open_pack_fetches_at_full_size() {
     let bodies: HashMap<String, File> =
         bodies().into_iter().map(|(from, body)| (from, File::new(&body))).collect();
@@ -147,7 +129,7 @@ fn open_pack_fetches_at_full_size() {
     let client = Client::new(Some(&server.address), None, Limits::default()).unwrap();
     let began = std::time::Instant::now();
     let (mut total, mut checks) = (0, 0.0);
-    for entry in catalogue().iter().filter(|k| k.packs.contains(&"open".into())) {
+    for entry in public() {
         let start = std::time::Instant::now();
         let report = fetch(&as_served(entry), &registry, folder.path(), &client, &Silent).unwrap();
         let bytes: u64 = report.files.iter().map(|f| f.downloaded).sum();
@@ -164,10 +146,8 @@ fn open_pack_fetches_at_full_size() {
         began.elapsed().as_secs_f64()
     );
     let found = inventory(&registry);
-    for (task, name) in
-        [(Task::Geometry, "da3"), (Task::Masks, "sam2_small"), (Task::Features, "siglip2_b16")]
-    {
+    for (task, name) in [(Task::Masks, "sam2_small"), (Task::Features, "siglip2_b16")] {
         assert_eq!(found.best(task).unwrap().name, name);
     }
-    assert!(total > 2_000_000_000);
+    assert!(total > 1_600_000_000);
 }
