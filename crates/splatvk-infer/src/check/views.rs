@@ -58,9 +58,9 @@ pub(super) fn check(model: &Installed, file: &GraphFile, steps: &mut Vec<Measure
     let mut lists = Lists { model, file, net, prepared, steps };
     for (k, count) in counts.iter().copied().enumerate() {
         let straight: Vec<usize> = (0..count).collect();
-        let plain = lists.run("", &straight).map_err(|e| match k {
-            0 => e,
-            _ => refuse(model, &format!("its number of photos is free, but {count} photos fail: {e}")),
+        let plain = lists.run("", &straight).map_err(|e| match fixed {
+            Some(_) => e,
+            None => refuse(model, &format!("its number of photos is free, but {count} photos fail: {e}")),
         })?;
         if count == 1 {
             continue;
@@ -122,7 +122,7 @@ impl Lists<'_> {
     fn same_first(&mut self, plain: &Estimate) -> Result<()> {
         let count = plain.cameras.len();
         let list: Vec<usize> = std::iter::once(0).chain((1..count).rev()).collect();
-        let other = self.run_sorted(", all but the first reversed", &list)?;
+        let other = self.run_sorted(", reversed but the first", &list)?;
         let worst = largest_difference(plain, &other);
         if let Some(last) = self.steps.last_mut() {
             last.error = Some(worst as f32);
