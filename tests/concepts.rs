@@ -127,7 +127,7 @@ fn image_encoder(layout: &Layout) -> Onnx {
         let data = vec![value; 3 * (side * side) as usize];
         graph = graph
             .output(name, &format!("batch 3 {side} {side}"))
-            .weight(&format!("all {name}").replace(' ', "_"), &[1, 3, side, side], &data)
+            .weight(&format!("all_{name}"), &[1, 3, side, side], &data)
             .node("Identity", &format!("all_{name}"), name, &[]);
     }
     graph
