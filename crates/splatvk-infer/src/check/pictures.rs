@@ -1,8 +1,8 @@
 //! Built-in pictures of a wall and of a box before it, with known matches between them.
 //!
-//! The cameras look straight at the wall and differ by a translation only. One step of the camera to
-//! the right moves the wall by 20 pixels and the box by 60 to the left, so the wall is three times
-//! as far away.
+//! The cameras look straight at the wall and differ by a translation only. One step of the camera
+//! to the right moves the wall by 20 pixels and the box by 60 to the left, so the wall is three
+//! times as far away.
 use std::sync::OnceLock;
 
 use crate::math::Random;
@@ -54,8 +54,8 @@ pub(super) fn place(k: usize) -> [f64; 2] {
     }
 }
 
-/// Surface of a pixel of the first (0) or second (1) picture, if it is at least [`MARGIN`] away from
-/// the border of the surface and its match lies in the other picture, as far from all borders.
+/// Surface of a pixel of the first (0) or second (1) picture, if it is at least [`MARGIN`] away
+/// from the border of the surface and its match lies in the other picture, as far from all borders.
 pub(super) fn surface(picture: usize, x: f64, y: f64) -> Option<Surface> {
     let step = picture as f64;
     let other = 1.0 - 2.0 * step;

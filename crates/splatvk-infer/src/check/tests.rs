@@ -1,5 +1,5 @@
-//! Stand-in networks that recognise the built-in pictures and answer with the true scene or with one
-//! fault. They compare their input with every picture and look the answer up.
+//! Stand-in networks that recognise the built-in pictures and answer with the true scene or with
+//! one fault. They compare their input with every picture and look the answer up.
 use std::path::Path;
 
 use splatvk_test_support::onnx::{Attribute, FLOAT, Onnx};
@@ -69,8 +69,8 @@ fn poses() -> Vec<f32> {
     (0..ALL).flat_map(one).collect()
 }
 
-/// Adds `name` [n]: the picture that each of the photos in `images`, [n, 3, H, W] or [1, n, 3, H, W],
-/// shows. Of |x − t|² only −2 x·t + |t|² depends on the picture t.
+/// Adds `name` [n]: the picture that each of the photos in `images`, [n, 3, H, W] or
+/// [1, n, 3, H, W], shows. Of |x − t|² only −2 x·t + |t|² depends on the picture t.
 fn recognised(graph: Onnx, images: &str, name: &str) -> Onnx {
     let rows = inputs();
     let length = rows[0].len();
@@ -272,8 +272,8 @@ fn traced_number_of_photos_is_refused() {
     assert!(text.contains("its number of photos is free, but 3 photos fail"), "{text}");
 }
 
-/// A pair network with the true points of the first two pictures; the second camera is `step` to the
-/// right of the first.
+/// A pair network with the true points of the first two pictures; the second camera is `step` to
+/// the right of the first.
 fn pair_network(step: f32) -> Result<Vec<Measured>> {
     let depth = depths();
     // Points of a picture in its own camera, or `by` to the right of it.

@@ -1,5 +1,5 @@
-//! Networks that take all photos in one call: the answer for a photo must not depend on its place in
-//! the list.
+//! Networks that take all photos in one call: the answer for a photo must not depend on its place
+//! in the list.
 //!
 //! A graph that was traced with one list can hold its length or order as constants, and then gives
 //! wrong cameras without an error. Attention over photos has no order of its own, but networks may
@@ -7,8 +7,8 @@
 //!
 //! - with the first photo in its place and the others in another order the same numbers must come,
 //!   up to the rounding of sums, whatever the weights are;
-//! - with another first photo, or a photo that occurs twice, a trained network gives nearly the same
-//!   scene, and one with random weights gives anything.
+//! - with another first photo, or a photo that occurs twice, a trained network gives nearly the
+//!   same scene, and one with random weights gives anything.
 use super::parallax::TwoViews;
 use super::pictures::pictures;
 use super::{Figure, Finding, Measured, Verdict, measured, record, refuse, rotation_degrees};
@@ -23,8 +23,8 @@ use crate::scene::{Camera, Pose};
 /// Numbers of photos for graphs that take any. The third and fourth differ from the one that an
 /// export was traced with, usually 2 or 4.
 const COUNTS: [usize; 4] = [2, 3, 4, 6];
-/// Largest difference with all photos but the first in another order, relative to the largest value.
-/// Other orders of float32 sums differ by about 1e-5, of float16 sums by 1e-2; another camera or
+/// Largest difference with all photos but the first in another order, relative to the largest
+/// value. Other orders of float32 sums differ by about 1e-5, of float16 sums by 1e-2; another camera or
 /// another order by a tenth and more.
 const EXACT: f64 = 0.02;
 /// Sampling step of depth comparisons, pixels.
