@@ -16,10 +16,10 @@ use crate::progress::Silent;
 use crate::scene::{Affine, DenseWarp, Pose};
 use crate::{pairs, warp};
 
-/// Largest angle between the second camera's direction and the x axis without a doubt, degrees: a
-/// few times what pose networks miss on real pairs of photos.
+/// Largest angle between the second camera's direction and the x axis without a doubt, degrees. A
+/// baseline of two pictures that is short against the depth leaves it uncertain.
 const DIRECTION: f64 = 30.0;
-/// Largest rotation without a doubt, degrees. A pan of 6° would move the wall by 60 pixels.
+/// Largest rotation without a doubt, degrees: a pan of 6° moves the whole picture by 60 pixels.
 const ROTATION: f64 = 10.0;
 /// Ratio of the depths of wall and box without a doubt; the truth is 3.
 const RATIO: [f64; 2] = [1.5, 6.0];

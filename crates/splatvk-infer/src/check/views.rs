@@ -20,12 +20,12 @@ use crate::multiview::{self, Estimate};
 use crate::prepare::Prepared;
 use crate::scene::{Camera, Pose};
 
-/// Numbers of photos for graphs that take any. The third and fourth differ from the one that an
-/// export was traced with, usually 2 or 4.
+/// Numbers of photos for graphs that take any. Exports are traced with 1, 2 or 4 as a rule, so 3
+/// and 6 are new to them.
 const COUNTS: [usize; 4] = [2, 3, 4, 6];
 /// Largest difference with all photos but the first in another order, relative to the largest
-/// value. Other orders of float32 sums differ by about 1e-5, of float16 sums by 1e-2; another camera or
-/// another order by a tenth and more.
+/// value. Measured: 5e-6 for Depth Anything 3 Base with random weights in float32. Float16 rounds a
+/// thousand times coarser.
 const EXACT: f64 = 0.02;
 /// Sampling step of depth comparisons, pixels.
 const STRIDE: usize = 7;
