@@ -50,6 +50,8 @@ pub fn fetch(args: &FetchArgs) -> Result<()> {
         }
     }
     check_licences(&missing, &args.accept)?;
+    // An export needs Python, which may be missing: before it comes everything that needs none.
+    missing.sort_by_key(|entry| entry.recipe.is_some());
     if !args.device.json {
         print(&all.iter().map(|w| model_text(w, folder, &client)).collect::<String>())?;
     }
