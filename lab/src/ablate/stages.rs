@@ -9,6 +9,7 @@ use serde::Serialize;
 use splatvk::eval::{EvalReport, Evaluation, GroundTruth, Split, TruthFrame};
 use splatvk::fit::{Trained, TrainedLanguage};
 use splatvk::language::{LevelMasks, ViewMasks, dir};
+use splatvk::math::dot;
 use splatvk::photo::Photo;
 use splatvk::photo::stem;
 use splatvk::pipeline::{Context, Lane, Output, Stage};
@@ -450,10 +451,11 @@ fn agreement(
     for ((k, o), n) in pairs {
         let Some(truth) = embeddings.get(&o) else { continue };
         let d = book.embedding_dim;
-        let row = &book.embeddings[k as usize * d..(k as usize + 1) * d];
-        let dot: f32 = row.iter().zip(truth).map(|(a, b)| a * b).sum();
+        // Means over photos are shorter than 1.
+        let mut row = book.embeddings[k as usize * d..(k as usize + 1) * d].to_vec();
+        dir::normalise_rows(&mut row, d);
         let sum: f32 = row.iter().zip(truth).zip(&scale.0).map(|((a, b), s)| s * (a - b) * (a - b)).sum();
-        cosine += n as f64 * f64::from(dot);
+        cosine += n as f64 * dot(&row, truth);
         square += n as f64 * f64::from(sum) / d as f64;
         total += n;
     }
