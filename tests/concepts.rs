@@ -157,9 +157,9 @@ fn text_encoder(layout: &Layout) -> Onnx {
     }
 }
 
-/// Logits: the product of the colours of the pixels, in −1..1, with the sum of the rows of the text,
-/// less the sum of the other feature maps, weighted with 1, 2 and 1 (0.9). The presence is small
-/// for rows other than those of colours.
+/// Logits: the product of the colours of the pixels, in −1..1, with the sum of the rows of the
+/// text, less the sum of the other feature maps, weighted with 1, 2 and 1 (0.9). The presence is
+/// small for rows other than those of colours.
 fn decoder(layout: &Layout) -> Onnx {
     let ([l0, l1, l2, position], [features, mask]) = (layout.levels, layout.text);
     let kind = if layout.is_usls { BOOL } else { INT64 };

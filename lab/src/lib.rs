@@ -1,7 +1,7 @@
-//! The laboratory of splatvk: the tables of the paper's experiments ([`ablate`]), data with ground
-//! truth ([`generate`]), the alignment alone ([`alignment`]), figures against seconds of training
-//! ([`curve`]), pictures ([`figures`]), evaluation protocols ([`protocol`]), and their commands ([`cli`], program
-//! `splatlab`). It is not part of the installed program.
+//! The laboratory of splatvk: the tables of the paper's experiments ([`ablate`]), its pictures
+//! ([`figures`]), data with ground truth ([`generate`]), the alignment alone ([`alignment`]),
+//! quality against seconds of training ([`curve`]), evaluation protocols ([`protocol`]), and their
+//! commands ([`cli`], program `splatlab`). It is not part of the installed program.
 #![warn(missing_docs)]
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]

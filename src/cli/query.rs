@@ -150,8 +150,8 @@ fn language(args: &QueryArgs, scene: &mut Scene) -> Result<Source> {
     Ok(Source::Language(Box::new(ready), Compat::answers(args.compat.as_deref(), &args.scene)?))
 }
 
-/// Asks a network about the photos of a scene. The photos of a file of Gaussians have the cameras of
-/// the views.
+/// Asks a network about the photos of a scene. The photos of a file of Gaussians have the cameras
+/// of the views.
 fn concepts(
     args: &QueryArgs,
     network: &str,

@@ -139,9 +139,9 @@ pub struct PhotoMasks<'a> {
     pub coverage: Option<&'a Coverage>,
 }
 
-/// Lifts masks of photos onto splats, in closed form: per thing the share [N] of the blending weight
-/// of a splat that lies inside the masks, over all photos that show it; 0 for splats that none
-/// shows. `photos` has one entry per camera with equally many masks.
+/// Lifts masks of photos onto splats, in closed form: per thing the share [N] of the blending
+/// weight of a splat that lies inside the masks, over all photos that show it; 0 for splats that
+/// none shows. `photos` has one entry per camera with equally many masks.
 pub fn lift_masks(
     device: &Device,
     cameras: &[Camera],

@@ -60,7 +60,8 @@ pub struct Answers {
     pub highlight: Highlight,
     /// Whether every text has a mask ([`QueryOptions::published`]).
     pub published: bool,
-    /// Findings of the network that looked at the photos; `None` where the scene's language answers.
+    /// Findings of the network that looked at the photos; `None` where the scene's language
+    /// answers.
     pub concepts: Option<ConceptFindings>,
 }
 
@@ -156,8 +157,8 @@ pub fn verdict(presence: Option<Presence>, reading: &Reading, found: usize, view
     }
 }
 
-/// Things of a selection with their pixels in views, and the reliability of the parts that the views
-/// show.
+/// Things of a selection with their pixels in views, and the reliability of the parts that the
+/// views show.
 pub(super) fn things(
     places: &Places,
     selection: &Selection,

@@ -1,5 +1,6 @@
 //! Queries answered by a network that finds a text in the photos (SAM 3) instead of by the scene's
-//! language: its masks of all photos are lifted onto the splats (docs/use/models.md#a-network-that-looks-at-the-photos).
+//! language: its masks of all photos are lifted onto the splats
+//! (docs/use/models.md#a-network-that-looks-at-the-photos).
 use super::answer::{self, Answers};
 use super::view::BlendedValues;
 use crate::files;
@@ -117,8 +118,8 @@ pub struct ConceptScene {
 }
 
 impl ConceptScene {
-    /// Asks the network for `texts` in every photo, and lifts its masks onto the splats. Every photo
-    /// has a camera of its size.
+    /// Asks the network for `texts` in every photo, and lifts its masks onto the splats. Every
+    /// photo has a camera of its size.
     pub fn open(
         device: &Device,
         splats: Splats,

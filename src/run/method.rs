@@ -218,7 +218,8 @@ impl Recipe {
             // the training.
             options.check_every = 0;
         }
-        // Codes of hundreds of numbers: the features of one level fill the largest buffer of a device.
+        // Codes of hundreds of numbers: the features of one level fill the largest buffer of a
+        // device.
         options.per_level |= self.reducer == Reducer::Unreduced;
         match self.language {
             LanguageFit::Train => {}

@@ -23,7 +23,8 @@ const LEVELS: [&str; 4] = ["level0", "level1", "level2", "position2"];
 /// Numbers of [`Detections::packed`] before the instances.
 const HEAD: usize = 7;
 
-/// A concept network. Its graphs are loaded when first needed: the text encoder, then the other two.
+/// A concept network. Its graphs are loaded when first needed: the text encoder, then the other
+/// two.
 pub struct Concepts {
     model: Installed,
     tokens: Tokens,

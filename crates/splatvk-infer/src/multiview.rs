@@ -12,7 +12,7 @@ use crate::progress::Progress;
 use crate::scene::{Camera, PairPointmaps, Pointmap, Pointmaps, Pose};
 use crate::{Error, Result};
 
-/// What a network gives for a list of photos.
+/// Answer of a network for a list of photos.
 pub(super) struct Estimate {
     /// One per photo, at the size of the input; world and unit are the network's.
     pub cameras: Vec<Camera>,

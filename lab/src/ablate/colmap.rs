@@ -1,5 +1,5 @@
-//! COLMAP models of a data set: cameras and sparse points in place of dense stereo (the rows "DC." and
-//! "SC." of the paper).
+//! COLMAP models of a data set: cameras and sparse points in place of dense stereo (the rows "DC."
+//! and "SC." of the paper).
 use crate::{Error, Result};
 use glam::Vec3;
 use serde::Serialize;

@@ -105,8 +105,8 @@ fn change(with: &[f64], without: &[f64]) -> (f64, f64) {
     (mean(&change), spread.sqrt() / change.len().max(1) as f64)
 }
 
-/// Mean adjusted Rand index per fault and steps, of level l and of the mean of s and m, and the mean
-/// change by each step over the scenes, with its standard error.
+/// Mean adjusted Rand index per fault and steps, of level l and of the mean of s and m, and the
+/// mean change by each step over the scenes, with its standard error.
 fn table(all: &[Vec<Scored>]) -> String {
     let mut out = String::new();
     for (title, of) in LEVELS {

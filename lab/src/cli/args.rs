@@ -28,7 +28,7 @@ pub struct Lab {
 pub enum Command {
     /// Data with ground truth → the tables of the paper's experiments
     Ablate(AblateArgs),
-    /// Data with ground truth → the paper's pictures: masks of methods, locations, alignment, failures
+    /// Data with ground truth → the paper's pictures: masks, locations, alignment, failures
     Figures(FiguresArgs),
     /// Data with ground truth → quality of a training against its seconds
     Curve(CurveArgs),

@@ -202,8 +202,8 @@ impl RegionEncoder for RegionWords {
         Ok((row, Some(vocabulary.look_up(text, meaning)?)))
     }
 
-    /// Names of probable classes and stuff, behind the region's colour where that raises the cosine:
-    /// "yellow lemon".
+    /// Names of probable classes and stuff, behind the region's colour where that raises the
+    /// cosine: "yellow lemon".
     fn name_regions(&mut self, regions: &[f32], best: usize) -> Result<Vec<Vec<(String, f32)>>> {
         let dim = self.dim();
         let vocabulary = self.vocabulary(&Silent)?;

@@ -232,8 +232,8 @@ impl<'a> Runner<'a> {
         Ok(Prepared { placed, geometry, language: (*made.get(s.aligned)?).clone(), seconds })
     }
 
-    /// Scores a training of [`Runner::prepared`] by protocol `field`; with `words`, lifts its language
-    /// and scores true masks with synthetic features.
+    /// Scores a training of [`Runner::prepared`] by protocol `field`; with `words`, lifts its
+    /// language and scores true masks with synthetic features.
     pub fn scored(&self, prepared: &Prepared, trained: &Trained, words: bool) -> Result<EvalReport> {
         let context = Context { device: self.device, registry: self.registry, progress: self.progress };
         let (mut field, mut queries) = (LanguageField::default(), Vec::new());
