@@ -118,7 +118,7 @@ fn export_omits_nonfinite_gaussians() {
     for (k, (column, value)) in [(0, f32::INFINITY), (9, f32::NAN), (10, 100.0)].into_iter().enumerate() {
         // Columns: x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0.
         let path = path_of(&format!("a{k}.ply"));
-        let options = ply::PlyOptions { degree: 0, language: None };
+        let options = ply::PlyOptions { degree: 0, ..ply::PlyOptions::default() };
         ply::write_splats(path.as_ref(), &splats(50), options).unwrap();
         overwrite(path.as_ref(), 7, column, value);
         for format in ["glb", "gltf", "splat", "compressed-ply", "spz", "ply"] {

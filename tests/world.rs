@@ -129,7 +129,7 @@ fn export_omits_unseen() {
         sh: vec![0.1; 6],
         ..Splats::default()
     };
-    let options = PlyOptions { degree: 0, language: None };
+    let options = PlyOptions { degree: 0, ..PlyOptions::default() };
     splatvk::format::ply::write_splats(&scene.join("backdrop.ply"), &backdrop, options).unwrap();
     let mut export = splatvk();
     export.arg("export").arg(&scene).args(["--format", "spz", "--guessed", "--out"]).arg(&out);

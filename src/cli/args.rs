@@ -10,6 +10,7 @@ mod shared;
 pub use super::batch::{BatchArgs, BatchRowArgs};
 pub use super::demo::DemoArgs;
 pub use super::export::ExportArgs;
+pub use super::label::LabelArgs;
 pub use super::measure::MeasureArgs;
 pub use super::run::RunArgs;
 pub use crate::run::config::whole;
@@ -36,6 +37,8 @@ pub enum Command {
     Run(Box<RunArgs>),
     /// Posed photos → scene without language
     Train(TrainArgs),
+    /// Splats of any trainer → scene with language
+    Label(LabelArgs),
     /// Scene + cameras → images
     Render(RenderArgs),
     /// Scene + texts → heat maps, masks, locations
@@ -91,6 +94,7 @@ impl Command {
         let device = match self {
             Command::Run(args) => &mut args.device,
             Command::Train(args) => &mut args.device,
+            Command::Label(args) => &mut args.device,
             Command::Query(args) => &mut args.device,
             Command::View(args) => &mut args.device,
             Command::Eval(args) => &mut args.device,

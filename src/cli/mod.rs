@@ -10,6 +10,7 @@ pub mod eval;
 mod export;
 mod fetch;
 mod kept;
+mod label;
 mod line;
 mod measure;
 mod models;
@@ -120,6 +121,7 @@ impl Program for Cli {
         match self.command {
             Command::Run(args) => run::run(&args),
             Command::Train(args) => train::train(&args),
+            Command::Label(args) => label::label(&args),
             Command::Render(args) => render::render(&args),
             Command::Query(args) => query::query(&args),
             Command::View(args) => view::view(&args),

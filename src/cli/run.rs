@@ -100,8 +100,8 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
             add: args.add.clone(),
             views: args.views,
             photo_masks: args.saving.photo_masks.clone(),
-            points: None,
             queries,
+            ..Inputs::default()
         },
         config,
         machine: args.device.machine(),

@@ -51,6 +51,12 @@ pub struct Trained {
 }
 
 impl Trained {
+    /// Splats of another program, with the cameras that show them.
+    pub fn given(splats: Splats, cameras: Vec<Camera>) -> Trained {
+        let stats = FitStats { splats: [splats.len(); 2], ..FitStats::default() };
+        Trained { splats, cameras, backdrop: Splats::default(), stats }
+    }
+
     /// Adds the backdrop. It is no part of training: before an opaque background surfaces would stay
     /// transparent.
     pub(super) fn with_backdrop(self, photos: &Photos, options: &RgbOptions) -> Trained {

@@ -190,6 +190,11 @@ impl Prepared {
         Prepared::new(splats, field, ShownPixels::of(field, frames.iter().map(|f| f.maps.as_ref())))
     }
 
+    /// Positions and codes of the splats.
+    pub(super) fn places(&self) -> &Places {
+        &self.places
+    }
+
     /// Cosines of the codes to canonical phrases; those of a scene's queries are all the same.
     fn cosines(&self, field: &LanguageField, canonicals: &[f32]) -> Cow<'_, CanonicalCosines> {
         let known = self.cosines.get_or_init(|| CanonicalCosines::new(field, canonicals));

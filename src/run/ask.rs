@@ -6,6 +6,7 @@ use crate::gpu::Device;
 use crate::infer::{RegionEncoder, things};
 use crate::pass::query_peaks::DeviceSearch;
 use crate::query::frame::FrameSearch;
+use crate::query::instances::Places;
 use crate::query::maps::CodeMaps;
 use crate::query::phrasing::{self, Reading, Vocabulary};
 use crate::query::presence::{Alternatives, ShownPixels};
@@ -115,6 +116,11 @@ impl QuerySession {
         Ok(())
     }
 
+    /// Positions and codes of the splats.
+    fn places(&self) -> &Places {
+        self.prepared.places()
+    }
+
     /// The understood part of a text.
     pub(super) fn reading(&mut self, text: &str) -> Result<Reading> {
         Ok(self.query(text, false)?.reading.clone())
@@ -212,6 +218,11 @@ impl QueryScene {
     /// The best phrases of the text model for each code: see [`RegionEncoder::name_regions`].
     pub fn names(&mut self) -> Result<CodeNames> {
         names(self.session.encoder.as_mut(), &self.field, NAMES)
+    }
+
+    /// Positions and codes of the splats.
+    pub fn places(&self) -> &Places {
+        self.session.places()
     }
 
     /// The text encoder.

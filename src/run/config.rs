@@ -138,7 +138,7 @@ pub const EXPERTS: &str = "For experts";
 /// The best installed network, else the first built-in source.
 const AUTO: &str = "auto";
 /// Points along each side of a photo at which a mask network is asked.
-const MASK_POINTS: usize = 32;
+pub const MASK_POINTS: usize = 32;
 
 impl Default for ReconstructionConfig {
     fn default() -> Self {

@@ -8,9 +8,9 @@ use super::plan::{Extras, Inputs, RunPlan};
 use super::preview::Preview;
 use super::remaining::{WithRemaining, Work};
 use super::sources::{self, GraphBuilder};
-use super::stages::{CameraOrigin, PlacedPhotos};
+use super::stages::{CameraOrigin, GivenViews, PlacedPhotos};
 use super::view::Viewer;
-use super::{photos, points, summary};
+use super::{label, photos, points, summary};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras};
 use crate::gpu::Device;
@@ -26,6 +26,9 @@ use std::time::Duration;
 
 /// Runs the plan and writes the scene directory, whole or not at all.
 pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
+    if let Some(splats) = &plan.inputs.splats {
+        return label::run(plan, splats, progress);
+    }
     let remaining = WithRemaining::new(progress);
     let progress = &Recorded::new(&remaining);
     plan.inputs.check()?;
@@ -67,8 +70,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let reconstruction = Reconstruction {
         config: &plan.config,
         queries,
-        base: base.as_ref(),
-        origin,
+        start: base.map_or(Start::Photos(origin), Start::Scene),
         remaining: &remaining,
         preview: Some(Preview::of(&workspace, &plan.output.out)),
     };
@@ -98,8 +100,7 @@ pub fn reconstruct(
     let reconstruction = Reconstruction {
         config,
         queries: &extras.queries,
-        base: None,
-        origin: given,
+        start: Start::Photos(given),
         remaining: &remaining,
         preview: None,
     };
@@ -116,19 +117,27 @@ pub fn save(outcome: &mut RunOutcome, out: &Path, force: bool, progress: &dyn Pr
     write(workspace, outcome, progress)
 }
 
+/// Begin of a reconstruction.
+pub(super) enum Start {
+    /// Photos, with given cameras or geometry instead of the source of the configuration.
+    Photos(Option<CameraOrigin>),
+    /// A scene that photos join.
+    Scene(Arc<BaseScene>),
+    /// Splats that get language.
+    Splats(GivenViews),
+}
+
 /// A reconstruction whose photos are read.
-struct Reconstruction<'a> {
-    config: &'a ReconstructionConfig,
-    queries: &'a [String],
-    base: Option<&'a Arc<BaseScene>>,
-    /// Given cameras or geometry, instead of the source of the configuration.
-    origin: Option<CameraOrigin>,
-    remaining: &'a WithRemaining<'a>,
-    preview: Option<Preview>,
+pub(super) struct Reconstruction<'a> {
+    pub(super) config: &'a ReconstructionConfig,
+    pub(super) queries: &'a [String],
+    pub(super) start: Start,
+    pub(super) remaining: &'a WithRemaining<'a>,
+    pub(super) preview: Option<Preview>,
 }
 
 impl Reconstruction<'_> {
-    fn run(
+    pub(super) fn run(
         self,
         device: &Device,
         registry: &Registry,
@@ -136,11 +145,11 @@ impl Reconstruction<'_> {
         store: &Store,
         progress: &Recorded,
     ) -> Result<RunOutcome> {
-        let Reconstruction { config, queries, base, origin, remaining, preview } = self;
+        let Reconstruction { config, queries, start, remaining, preview } = self;
         // Everything that can be refused is read before the long stages.
         config.check()?;
         // Given cameras and points need no network.
-        let given = matches!(origin, Some(CameraOrigin::GivenGeometry(_)));
+        let given = matches!(start, Start::Photos(Some(CameraOrigin::GivenGeometry(_))));
         let needs_networks = config.language.is_some() || !given;
         if needs_networks {
             registry.compute().report(progress)?;
@@ -163,9 +172,14 @@ impl Reconstruction<'_> {
         });
         let build = GraphBuilder::new(config, preset, registry);
         let mut plan = ScenePlan { build, config, queries, device, preview };
-        let scene = match base {
-            Some(base) => plan.added(base, photos)?,
-            None => plan.scene(photos, origin)?,
+        let (mut base, mut full_colour) = (None, None);
+        let scene = match start {
+            Start::Photos(origin) => plan.scene(photos, origin)?,
+            Start::Scene(scene) => plan.added(base.insert(scene), photos)?,
+            Start::Splats(mut views) => {
+                full_colour = Some((std::mem::take(&mut views.frames), views.shows_photos));
+                plan.labelled(views)?
+            }
         };
         let mut made = plan.build.graph.run(&scene.targets(), device, registry, store, progress)?;
         if needs_networks {
@@ -173,7 +187,7 @@ impl Reconstruction<'_> {
         }
         let trained = made.take(scene.trained)?;
         let PlacedPhotos { photos, left_out, .. } = made.take(scene.placed)?;
-        let (splats, frames, language) = match scene.language {
+        let (splats, mut frames, language) = match scene.language {
             Some(outputs) => {
                 let language = made.take(outputs.language)?;
                 let outcome = LanguageOutcome {
@@ -191,10 +205,15 @@ impl Reconstruction<'_> {
                 (trained.splats, frames, None)
             }
         };
-        let psnr = super::fidelity::psnr(&frames, &photos);
+        let mut shows_photos = true;
+        if let Some((full, are_photos)) = full_colour {
+            frames.iter_mut().zip(full).for_each(|(frame, full)| frame.rendered = full);
+            shows_photos = are_photos;
+        }
+        let psnr = if shows_photos { super::fidelity::psnr(&frames, &photos) } else { Vec::new() };
         super::fidelity::warn(&photos, &psnr, progress);
         let mut geometry = made.take(scene.geometry)?;
-        if let Some(base) = base {
+        if let Some(base) = &base {
             let new = std::mem::replace(&mut geometry.points, base.points.clone());
             geometry.points.append(new);
         }
@@ -207,9 +226,12 @@ impl Reconstruction<'_> {
             photos,
             left_out,
             geometry,
-            known: base.map_or(0, |b| b.known.photos.len()),
+            known: base.as_ref().map_or(0, |b| b.known.photos.len()),
             cameras: trained.cameras,
-            world: World { up: made.take(scene.up)?, scale: base.and_then(|b| b.world.scale.clone()) },
+            world: World {
+                up: made.take(scene.up)?,
+                scale: base.as_ref().and_then(|b| b.world.scale.clone()),
+            },
             splats,
             seen,
             backdrop: trained.backdrop,
@@ -228,7 +250,7 @@ impl Reconstruction<'_> {
 }
 
 /// Stage outputs on disk.
-fn store(resume: bool, checkpoint_seconds: u64) -> Result<Store> {
+pub(super) fn store(resume: bool, checkpoint_seconds: u64) -> Result<Store> {
     match stage_folder() {
         Ok(folder) => Ok(Store::at(folder, resume, Duration::from_secs(checkpoint_seconds))),
         Err(e) if resume => Err(e),
@@ -241,7 +263,7 @@ pub fn stage_folder() -> Result<PathBuf> {
     Ok(home()?.join("stages"))
 }
 
-fn write(workspace: Workspace, outcome: &RunOutcome, progress: &dyn Progress) -> Result<()> {
+pub(super) fn write(workspace: Workspace, outcome: &RunOutcome, progress: &dyn Progress) -> Result<()> {
     progress.begin("write", 2);
     progress.check()?;
     let language = outcome.plan.config.language.as_ref();

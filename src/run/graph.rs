@@ -8,11 +8,11 @@ use super::sources::{
     self, DepthSources, FeatureSources, GeometrySources, Given, GraphBuilder, MaskSources, MatchSources,
     PosedPhotos,
 };
-use super::stages::{self, CameraOrigin, PlacedPhotos, SharedEncoder};
+use super::stages::{self, CameraOrigin, GivenViews, PlacedPhotos, SharedEncoder};
 use crate::fit::{Trained, TrainedLanguage};
 use crate::gpu::Device;
 use crate::infer::Registry;
-use crate::language::Language;
+use crate::language::{Language, ViewMasks};
 use crate::photo::Photo;
 use crate::pipeline::Output;
 use crate::pose;
@@ -116,10 +116,7 @@ impl ScenePlan<'_> {
                 let masks = sources::make::<MaskSources>(&language.masks, &registry, (build, posed))?;
                 let build = &mut self.build;
                 let matches = sources::make::<MatchSources>(&language.matcher, &registry, (build, posed))?;
-                let regions = stages::RegionFeatures { encoder: query_inputs.encoder.clone() };
-                let regions = self.build.graph.add(regions, (placed, masks));
-                let surfaces = stages::SurfaceFeatures { encoder: query_inputs.encoder.clone() };
-                let regions = self.build.graph.add(surfaces, (placed, regions, geometry));
+                let regions = self.described(&query_inputs.encoder, posed, masks);
                 let recipe = language.recipe(self.config.training.preset);
                 let (seed, space) = (self.build.seed, query_inputs.encoder.space().to_owned());
                 let align = stages::Align { recipe, space, seed };
@@ -167,20 +164,63 @@ impl ScenePlan<'_> {
                 };
                 let build = &mut self.build;
                 let masks = sources::make::<MaskSources>(&language.masks, &registry, (build, new))?;
-                let graph = &mut self.build.graph;
-                let regions = stages::RegionFeatures { encoder: query_inputs.encoder.clone() };
-                let regions = graph.add(regions, (new.placed, masks));
-                let surfaces = stages::SurfaceFeatures { encoder: query_inputs.encoder.clone() };
-                let regions = graph.add(surfaces, (new.placed, regions, new.geometry));
+                let regions = self.described(&query_inputs.encoder, new, masks);
                 let recipe = language.recipe(self.config.training.preset);
                 let options = recipe.build(query_inputs.encoder.space(), seed);
                 let align = stages::AlignAdded { base: base.clone(), options };
-                let aligned = graph.add(align, (regions, geometry, trained));
+                let aligned = self.build.graph.add(align, (regions, geometry, trained));
                 self.language(query_inputs, placed, trained, aligned)
             }
             _ => None,
         };
         Ok(SceneOutputs { placed, geometry, trained, up, language })
+    }
+
+    /// Adds the stages that give the splats of `views` language.
+    pub(super) fn labelled(&mut self, mut views: GivenViews) -> Result<SceneOutputs> {
+        let registry = self.build.registry.clone();
+        let encoder = self.encoder()?;
+        let graph = &mut self.build.graph;
+        let placed = graph.add(stages::GivenPhotos::new(&mut views), ());
+        let geometry = graph.add(stages::GivenGeometry, (placed,));
+        let GivenViews { identity, splats, up, shows_photos, .. } = views;
+        let trained = graph.add(stages::GivenSplats { identity, splats }, (geometry,));
+        let up = match up.is_none() && shows_photos {
+            true => graph.add(stages::Upright, (placed, geometry, trained)),
+            false => graph.add(stages::KnownUp(up), ()),
+        };
+        let (Some(language), Some(encoder)) = (&self.config.language, encoder) else {
+            return Ok(SceneOutputs { placed, geometry, trained, up, language: None });
+        };
+        let (recipe, posed) =
+            (language.recipe(self.config.training.preset), PosedPhotos { placed, geometry });
+        let query_inputs = self.query_inputs(encoder);
+        let masks = sources::make::<MaskSources>(&language.masks, &registry, (&mut self.build, posed))?;
+        let regions = self.described(&query_inputs.encoder, posed, masks);
+        let (seed, space) = (self.build.seed, query_inputs.encoder.space().to_owned());
+        let graph = &mut self.build.graph;
+        let matches = graph.add(stages::ReprojectedMatches, (geometry,));
+        let aligned = graph.add(stages::Align { recipe, space, seed }, (regions, matches, geometry));
+        let language = self.config.language_options(self.build.preset).map(|options| {
+            let lift = stages::LiftLanguage(stages::TrainLanguage { recipe, options });
+            let language = self.build.graph.add(lift, (placed, trained, aligned));
+            self.answered(query_inputs, trained, aligned, language)
+        });
+        Ok(SceneOutputs { placed, geometry, trained, up, language })
+    }
+
+    /// Adds the features of masks: those of the encoder, then the shapes of their surfaces.
+    fn described(
+        &mut self,
+        encoder: &SharedEncoder,
+        posed: PosedPhotos,
+        masks: Output<Vec<ViewMasks>>,
+    ) -> Output<Vec<ViewMasks>> {
+        let PosedPhotos { placed, geometry } = posed;
+        let regions = stages::RegionFeatures { encoder: encoder.clone() };
+        let regions = self.build.graph.add(regions, (placed, masks));
+        let surfaces = stages::SurfaceFeatures { encoder: encoder.clone() };
+        self.build.graph.add(surfaces, (placed, regions, geometry))
     }
 
     /// The encoder of the features; `None` without language.
@@ -221,13 +261,25 @@ impl ScenePlan<'_> {
         let config = self.config.language.as_ref()?;
         let (recipe, options) =
             (config.recipe(self.config.training.preset), self.config.language_options(self.build.preset)?);
-        let QueryInputs { encoder, queries } = query_inputs;
+        let train = stages::TrainLanguage { recipe, options };
+        let language = self.build.graph.add(train, (placed, trained, aligned));
+        Some(self.answered(query_inputs, trained, aligned, language))
+    }
+
+    /// Adds the stages from splats with features to answers.
+    fn answered(
+        &mut self,
+        QueryInputs { encoder, queries }: QueryInputs,
+        trained: Output<Trained>,
+        aligned: Output<Language>,
+        language: Output<TrainedLanguage>,
+    ) -> LanguageOutputs {
+        let compat = self.config.language.as_ref().and_then(|language| language.compat);
         let graph = &mut self.build.graph;
         let names = graph.add(stages::NameCodes { encoder }, (aligned,));
-        let language = graph.add(stages::TrainLanguage { recipe, options }, (placed, trained, aligned));
         let frames = graph.add(stages::DecodeViews, (trained, language));
-        let options = query_options(config.compat);
+        let options = query_options(compat);
         let answers = graph.add(stages::AnswerQueries { options }, (trained, frames, language, queries));
-        Some(LanguageOutputs { aligned, names, language, frames, answers })
+        LanguageOutputs { aligned, names, language, frames, answers }
     }
 }

@@ -103,13 +103,13 @@ pub(super) fn camera_file(plan: &RunPlan) -> Option<&Path> {
 }
 
 /// Origin of the masks of the photos.
-fn masks(plan: &RunPlan) -> Result<MaskChoice> {
+pub(super) fn masks(plan: &RunPlan) -> Result<MaskChoice> {
     cameras::masks(plan.inputs.photo_masks.as_deref(), camera_file(plan))
 }
 
 /// Photos with a camera in the input folder and in the folders below it that names of cameras
 /// contain; `None` for videos, whose frames get names when they are read.
-fn with_cameras(
+pub(super) fn with_cameras(
     plan: &RunPlan,
     known: &CameraFile,
     progress: &dyn Progress,

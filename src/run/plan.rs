@@ -53,6 +53,12 @@ pub struct Inputs {
     /// Points to start from (`.ply`, a COLMAP model folder or a data set that holds one), in the
     /// frame of the cameras of `init`, instead of those of stereo.
     pub points: Option<PathBuf>,
+    /// A scene directory or a file of Gaussians whose splats get language, instead of splats that
+    /// are trained on the photos.
+    pub splats: Option<PathBuf>,
+    /// Number of views that are rendered for `splats` without photos; `None` = a default where there
+    /// are no photos and cameras.
+    pub synthesize: Option<usize>,
     /// Texts to answer in the finished scene.
     pub queries: Vec<String>,
 }
@@ -148,8 +154,8 @@ impl Machine {
 impl RunPlan {
     /// The files and folders that the run reads.
     pub fn read(&self) -> impl Iterator<Item = &Path> {
-        let Inputs { photos, add, photo_masks, points, .. } = &self.inputs;
-        let folders = [add, photo_masks, points, &self.machine.models].into_iter().flatten();
+        let Inputs { photos, add, photo_masks, points, splats, .. } = &self.inputs;
+        let folders = [add, photo_masks, points, splats, &self.machine.models].into_iter().flatten();
         let arguments = self.config.sources().filter_map(|s: &SourceChoice| s.argument.as_ref());
         photos.iter().chain(arguments).chain(folders).map(PathBuf::as_path)
     }

@@ -102,14 +102,21 @@ fn figures(o: &RunOutcome) -> Vec<Figure> {
         let names: Vec<&str> = o.left_out.iter().map(|l| l.photo.as_str()).collect();
         chosen += &format!("; left out: {}", names.join(", "));
     }
-    let mut list = vec![
-        Figure::that_matters(
-            "photos",
-            sizes(&o.photos) + &chosen,
-            "The photos that the scene was made from, at the size they were worked on.",
-        ),
-        super::fidelity::figure(&o.psnr),
-    ];
+    let mut list = match o.psnr.is_empty() {
+        true => vec![Figure::that_matters(
+            "views",
+            sizes(&o.photos) + ", rendered from the splats",
+            "The pictures in which things were found and named. No photo confirms them.",
+        )],
+        false => vec![
+            Figure::that_matters(
+                "photos",
+                sizes(&o.photos) + &chosen,
+                "The photos that the scene was made from, at the size they were worked on.",
+            ),
+            super::fidelity::figure(&o.psnr),
+        ],
+    };
     list.extend(confidence_figure(&o.photos, &o.geometry.fitted, &o.psnr).map(|text| {
         let meaning = "How well the photos agree on where they were taken. Below high, shapes and lengths may be wrong.";
         Figure::that_matters("cameras", text, meaning)

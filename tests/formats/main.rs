@@ -64,7 +64,7 @@ fn gaussian_ply_round_trips() {
     let path = folder.path().join("a.ply");
     for degree in 0..=3 {
         let s = splats(7, degree);
-        ply::write_splats(&path, &s, ply::PlyOptions { degree, language: None }).unwrap();
+        ply::write_splats(&path, &s, ply::PlyOptions { degree, ..ply::PlyOptions::default() }).unwrap();
         assert_eq!(ply::read_splats(&path).unwrap(), s);
         // Padded to degree 3, as most viewers expect: the added coefficients are zero.
         ply::write_splats(&path, &s, ply::PlyOptions::default()).unwrap();
@@ -86,7 +86,12 @@ fn ply_fields_follow_format_order() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.ply");
     let s = splats(2, 1);
-    ply::write_splats(&path, &s, ply::PlyOptions { degree: 1, language: Some(&field(2)) }).unwrap();
+    ply::write_splats(
+        &path,
+        &s,
+        ply::PlyOptions { degree: 1, language: Some(&field(2)), ..ply::PlyOptions::default() },
+    )
+    .unwrap();
     let bytes = std::fs::read(&path).unwrap();
     let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
     let header = String::from_utf8(bytes[..end].to_vec()).unwrap();

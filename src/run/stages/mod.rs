@@ -3,6 +3,7 @@
 mod added;
 mod answers;
 mod cameras;
+mod given;
 mod language;
 pub mod masks;
 mod matches;
@@ -13,6 +14,7 @@ mod splats;
 pub use added::{AddedCameras, AddedDepth, AlignAdded, KnownUp, OnlyAdded, OnlyAddedGeometry, TrainOn};
 pub use answers::{AnswerQueries, DecodeViews};
 pub use cameras::{CameraOrigin, Cameras, DenseDepth, KnownGeometry, PlacedPhotos, Upright};
+pub use given::{GivenGeometry, GivenPhotos, GivenSplats, GivenViews, LiftLanguage, ReprojectedMatches};
 pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage};
 pub use masks::{
     ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures, SurfaceFeatures,

@@ -136,6 +136,11 @@ impl Places {
         }
     }
 
+    /// [N] opacities.
+    pub fn weights(&self) -> &[f64] {
+        &self.weights
+    }
+
     /// Per level the splats of every code.
     pub fn lists(&self) -> &[CodeLists] {
         &self.lists
@@ -258,8 +263,8 @@ impl Visible {
         self.0.iter().map(|s| s.0).collect()
     }
 
-    /// Those of `splats`, ascending.
-    fn of<'a>(&'a self, splats: &'a [usize]) -> impl Iterator<Item = (usize, DVec2)> + 'a {
+    /// Those of `splats`, which ascend.
+    pub fn of<'a>(&'a self, splats: &'a [usize]) -> impl Iterator<Item = (usize, DVec2)> + 'a {
         let mut rest = splats;
         self.0.iter().copied().filter(move |(i, _)| {
             let skipped = rest.iter().take_while(|own| **own < *i).count();

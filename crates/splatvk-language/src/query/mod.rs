@@ -16,6 +16,7 @@ pub mod presence;
 mod result;
 mod score;
 pub mod select;
+pub mod things;
 pub mod window;
 
 pub use self::frame::{LevelPeaks, Table, answer, answer_all, answer_with, relevancy_map};

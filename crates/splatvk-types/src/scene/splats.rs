@@ -92,6 +92,18 @@ impl Splats {
             antialiased: self.antialiased,
         }
     }
+    /// The splats with colours of SH degree 0, which do not depend on the direction.
+    pub fn bare(&self) -> Splats {
+        Splats {
+            means: self.means.clone(),
+            log_scales: self.log_scales.clone(),
+            quats: self.quats.clone(),
+            opacity_logits: self.opacity_logits.clone(),
+            sh_degree: 0,
+            sh: self.sh.chunks_exact(3 * self.sh_len()).flat_map(|row| &row[..3]).copied().collect(),
+            antialiased: self.antialiased,
+        }
+    }
     /// Coefficients per channel.
     pub fn sh_len(&self) -> usize {
         sh_coefficients(self.sh_degree)

@@ -129,11 +129,13 @@ pub struct PlyOptions<'a> {
     /// Appends unit features and code indices per level after all standard columns; viewers skip
     /// unknown columns.
     pub language: Option<&'a LanguageField>,
+    /// Appends the property `int object`: the number of the thing of every splat, 0 = none.
+    pub objects: Option<&'a [u32]>,
 }
 
 impl Default for PlyOptions<'_> {
     fn default() -> Self {
-        PlyOptions { degree: 3, language: None }
+        PlyOptions { degree: 3, language: None, objects: None }
     }
 }
 
@@ -147,7 +149,10 @@ pub fn write_splats(path: &Path, s: &Splats, options: PlyOptions) -> Result<()> 
     let mut out = std::io::BufWriter::new(file);
     let mut row: Vec<u8> = Vec::new();
     let mut write = |bytes: &[u8]| out.write_all(bytes).map_err(Error::unwritable(path));
-    write(splat_header(s, rest, &levels).as_bytes())?;
+    if options.objects.is_some_and(|objects| objects.len() != s.len()) {
+        return Err(Error::work("numbers of things for another number of splats"));
+    }
+    write(splat_header(s, rest, &levels, options.objects.is_some()).as_bytes())?;
     let have = s.sh_len();
     for i in 0..s.len() {
         row.clear();
@@ -165,6 +170,9 @@ pub fn write_splats(path: &Path, s: &Splats, options: PlyOptions) -> Result<()> 
         }
         for (_, level) in &levels {
             row.extend_from_slice(&nearest_code(level, i).to_le_bytes());
+        }
+        if let Some(objects) = options.objects {
+            row.extend_from_slice(&objects[i].to_le_bytes());
         }
         write(&row)?;
     }
@@ -185,7 +193,7 @@ fn named_levels(field: &LanguageField, n: usize) -> Result<Vec<(&'static str, &L
     }
 }
 
-fn splat_header(s: &Splats, rest: usize, levels: &[(&str, &LevelField)]) -> String {
+fn splat_header(s: &Splats, rest: usize, levels: &[(&str, &LevelField)], objects: bool) -> String {
     let mut h = String::from("ply\nformat binary_little_endian 1.0\n");
     if s.antialiased {
         h.push_str(ply_comments::MIP);
@@ -216,6 +224,9 @@ fn splat_header(s: &Splats, rest: usize, levels: &[(&str, &LevelField)]) -> Stri
     levels.iter().for_each(|(l, _)| {
         let _ = writeln!(h, "property int code_{l}");
     });
+    if objects {
+        h.push_str("property int object\n");
+    }
     h.push_str("end_header\n");
     h
 }

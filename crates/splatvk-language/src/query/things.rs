@@ -1,0 +1,153 @@
+//! The things of a scene, without a text: connected groups of the splats of every code, on every
+//! level.
+use super::instances::{Instance, Places};
+use std::collections::BTreeMap;
+
+/// Index of no thing.
+const NONE: u32 = u32::MAX;
+
+/// A thing.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Thing {
+    /// Level, index as in [`crate::scene::LEVEL_NAMES`].
+    pub level: usize,
+    /// Its code of the level.
+    pub code: usize,
+    /// Index among the groups of the code, heaviest first.
+    pub group: usize,
+    /// Splats and boxes; `share` is that of the opacity of the whole scene.
+    pub instance: Instance,
+    /// Index of the thing of a coarser level that contains most of it.
+    pub parent: Option<usize>,
+}
+
+impl Thing {
+    /// Number that is unique within the level: `65536 · group + code + 1`. It stays the same while
+    /// the codes do, also when photos join the scene; 0 is no thing.
+    pub fn number(&self) -> u32 {
+        ((self.group as u32) << 16) + self.code as u32 + 1
+    }
+}
+
+impl Places {
+    /// Things with at least `least_share` of the opacity of the scene: coarsest level first, on each
+    /// level in the order of their codes. No splat is in two things of a level.
+    pub fn things(&self, least_share: f64) -> Vec<Thing> {
+        let all: f64 = self.weights().iter().sum();
+        let mut things: Vec<Thing> = Vec::new();
+        // Per coarser level the index of the thing of every splat.
+        let mut owners: Vec<Vec<u32>> = Vec::new();
+        for (level, lists) in self.lists().iter().enumerate().rev() {
+            let mut owner = vec![NONE; self.weights().len()];
+            for code in 0..lists.counts().count() {
+                let splats = lists.splats_of(std::iter::once(code));
+                for (group, mut instance) in self.instances(&splats, level).into_iter().enumerate() {
+                    let weight: f64 = instance.splats.iter().map(|i| self.weights()[*i]).sum();
+                    instance.share = weight / all;
+                    if instance.share < least_share {
+                        continue;
+                    }
+                    let parent = owners.iter().rev().find_map(|o| self.container(&instance, weight, o));
+                    instance.splats.iter().for_each(|i| owner[*i] = things.len() as u32);
+                    things.push(Thing { level, code, group, instance, parent });
+                }
+            }
+            owners.push(owner);
+        }
+        things
+    }
+
+    /// Thing that contains more than half of the weight of an instance.
+    fn container(&self, instance: &Instance, weight: f64, owner: &[u32]) -> Option<usize> {
+        let mut shares: BTreeMap<u32, f64> = BTreeMap::new();
+        for splat in &instance.splats {
+            *shares.entry(owner[*splat]).or_default() += self.weights()[*splat];
+        }
+        let most = shares.into_iter().find(|(thing, share)| *thing != NONE && 2.0 * share > weight);
+        most.map(|(thing, _)| thing as usize)
+    }
+}
+
+/// Number of the thing of every splat on a level, [splats]; 0 for splats of none.
+pub fn numbers(things: &[Thing], level: usize, splats: usize) -> Vec<u32> {
+    let mut numbers = vec![0; splats];
+    for thing in things.iter().filter(|thing| thing.level == level) {
+        thing.instance.splats.iter().for_each(|i| numbers[*i] = thing.number());
+    }
+    numbers
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Codebook, LanguageField, LevelField, Splats};
+
+    /// 20 splats of a cup at x = 0 and 20 of a second one at x = 5, on a table of 60 at y = 1, and a
+    /// speck of two far away.
+    fn scene() -> (Splats, LanguageField) {
+        let row = |x: f32, y: f32, n: usize| (0..n).map(move |i| [x + 0.01 * i as f32, y, 1.0]);
+        let means: Vec<[f32; 3]> = row(0.0, 0.0, 20)
+            .chain(row(5.0, 0.0, 20))
+            .chain(row(0.0, 1.0, 60))
+            .chain(row(50.0, 9.0, 2))
+            .collect();
+        let count = means.len();
+        let splats = Splats {
+            means,
+            log_scales: vec![[0.01f32.ln(); 3]; count],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; count],
+            opacity_logits: vec![2.0; count],
+            ..Splats::default()
+        };
+        let codes = vec![1.0, 0.0, 0.0, 1.0];
+        let level = |code_of: fn(usize) -> usize| LevelField {
+            codebook: Codebook {
+                embedding_dim: 2,
+                code_dim: 2,
+                embeddings: codes.clone(),
+                codes: codes.clone(),
+                ..Codebook::default()
+            },
+            features: (0..count)
+                .flat_map(|i| if code_of(i) == 0 { [1.0, 0.0] } else { [0.0, 1.0] })
+                .collect(),
+            ..LevelField::default()
+        };
+        // Whole: cups are code 0, the table and the speck code 1. Part: halves of the first cup.
+        let (whole, part) = (level(|i| usize::from(i >= 40)), level(|i| usize::from(i >= 10)));
+        (splats, LanguageField { levels: vec![LevelField::default(), part, whole], space: String::new() })
+    }
+
+    #[test]
+    fn things_are_connected_groups_of_codes() {
+        let (splats, field) = scene();
+        let things = Places::of(&splats, &field).things(0.05);
+        let listed: Vec<_> =
+            things.iter().map(|t| (t.level, t.number(), t.instance.splats.len(), t.parent)).collect();
+        // Of the part level, code 1 is the rest: the second half of the first cup is too small
+        // beside the table, of which it is no part.
+        assert_eq!(
+            listed,
+            [
+                (2, 1, 20, None),
+                (2, 65537, 20, None),
+                (2, 2, 60, None),
+                (1, 1, 10, Some(0)),
+                (1, 2, 60, Some(2)),
+                (1, 65538, 20, Some(1)),
+                (1, 131074, 10, Some(0))
+            ]
+        );
+        let share = things[2].instance.share;
+        assert!((share - 60.0 / 102.0).abs() < 1e-9, "{share}");
+    }
+
+    #[test]
+    fn every_splat_has_one_number() {
+        let (splats, field) = scene();
+        let things = Places::of(&splats, &field).things(0.05);
+        let numbers = numbers(&things, 2, splats.len());
+        assert_eq!((numbers[0], numbers[20], numbers[40], numbers[101]), (1, 65537, 2, 0));
+        assert!(Places::of(&splats, &field).things(0.3).iter().all(|t| t.instance.share >= 0.3));
+    }
+}
