@@ -12,6 +12,7 @@ pub use super::demo::DemoArgs;
 pub use super::export::ExportArgs;
 pub use super::label::LabelArgs;
 pub use super::measure::MeasureArgs;
+pub use super::objects::ObjectsArgs;
 pub use super::run::RunArgs;
 pub use crate::run::config::whole;
 pub use crate::run::config::{EXPERTS, compat_names as compats};
@@ -43,6 +44,8 @@ pub enum Command {
     Render(RenderArgs),
     /// Scene + texts → heat maps, masks, locations
     Query(QueryArgs),
+    /// Scene → list of its things, with a file each
+    Objects(ObjectsArgs),
     /// Look at a scene in the browser, and ask it
     View(ViewArgs),
     /// Lengths in a scene; one that is known gives the scene its scale
@@ -96,6 +99,7 @@ impl Command {
             Command::Train(args) => &mut args.device,
             Command::Label(args) => &mut args.device,
             Command::Query(args) => &mut args.device,
+            Command::Objects(args) => &mut args.device,
             Command::View(args) => &mut args.device,
             Command::Eval(args) => &mut args.device,
             Command::Models(args) => match &mut args.action {
@@ -151,6 +155,12 @@ pub struct TrainArgs {
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
+}
+
+/// A share from 0 to 1.
+pub fn share(text: &str) -> Result<f64, String> {
+    let value: f64 = text.parse().map_err(|_| "give a number from 0 to 1".to_owned())?;
+    if (0.0..=1.0).contains(&value) { Ok(value) } else { Err("give a number from 0 to 1".to_owned()) }
 }
 
 /// Views of `render --path`.
@@ -278,6 +288,10 @@ pub struct EvalArgs {
     /// Folder with ground_truth.json
     #[arg(long, value_name = "DIR")]
     pub ground_truth: PathBuf,
+    /// Another scene in the coordinates of this one, whose views are the train frames: for scenes
+    /// of splatvk label, whose own views may be renders
+    #[arg(long, value_name = "SCENE")]
+    pub cameras_of: Option<PathBuf>,
     /// Write every rendered view and predicted mask here
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,

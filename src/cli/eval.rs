@@ -24,10 +24,14 @@ pub(super) fn eval(args: &EvalArgs) -> Result<()> {
     if args.cameras.is_some() {
         return Err(Error::input("--cameras: ground_truth.json has the cameras; leave it out"));
     }
-    let inputs: [&Path; 2] = [&args.scene, &args.ground_truth];
+    let inputs = [Some(args.scene.as_path()), Some(&args.ground_truth), args.cameras_of.as_deref()];
+    let inputs: Vec<&Path> = inputs.into_iter().flatten().collect();
     let open = |out| WrittenFiles::open(out, args.force, &inputs);
     let out = args.out.as_deref().map(open).transpose()?;
-    let scene = scene::load(&args.scene)?;
+    let mut scene = scene::load(&args.scene)?;
+    if let Some(other) = &args.cameras_of {
+        scene.cameras = scene::load(other)?.cameras;
+    }
     let scores = score_scene(&scene, args, out.as_ref())?;
     report(&scores, out, args.text.then(|| scores.text()), args.device.json)
 }

@@ -187,7 +187,7 @@ pub fn write(args: &ExportArgs) -> Result<()> {
             if args.with_features {
                 warn_of_models(&scene);
             }
-            let options = ply::PlyOptions { degree: args.ply_degree, language };
+            let options = ply::PlyOptions { degree: args.ply_degree, language, objects: None };
             file.keep(|path| ply::write_splats(path, &scene.splats, options))?;
         }
     }

@@ -14,6 +14,7 @@ mod label;
 mod line;
 mod measure;
 mod models;
+mod objects;
 pub mod outputs;
 mod path;
 pub mod print;
@@ -124,6 +125,7 @@ impl Program for Cli {
             Command::Label(args) => label::label(&args),
             Command::Render(args) => render::render(&args),
             Command::Query(args) => query::query(&args),
+            Command::Objects(args) => objects::objects(&args),
             Command::View(args) => view::view(&args),
             Command::Eval(args) => eval::eval(&args),
             Command::Measure(args) => measure::measure(&args),

@@ -132,7 +132,7 @@ fn instance_json(i: &Instance, views: &[String], metres_per_unit: Option<f64>) -
 }
 
 /// Centre and boxes of an instance in units of `1 / unit` scene units.
-fn placement_json(i: &Instance, unit: f64) -> Value {
+pub(super) fn placement_json(i: &Instance, unit: f64) -> Value {
     let oriented = &i.oriented;
     let axes: Vec<_> = oriented.axes.iter().map(|axis| axis.to_array()).collect();
     json!({

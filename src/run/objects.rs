@@ -1,20 +1,26 @@
 //! A scene as a list of things with names, boxes and the view that shows each best.
+use super::answer::placement_json;
 use super::ask::QueryScene;
 use crate::Result;
+use crate::infer::stuff;
 use crate::progress::Progress;
 use crate::query::QueryOptions;
 use crate::query::instances::Instance;
 use crate::query::phrasing;
 use crate::query::presence::Presence;
 use crate::query::things::Thing;
-use crate::scene::{Camera, LEVEL_NAMES};
+use crate::scene::{Camera, LEVEL_NAMES, RgbImage, World};
 use serde::Serialize;
+use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Least IoU of a thing and an instance of an answer that mean the same.
 const SAME_THING: f64 = 0.5;
 /// Names per code of the encoder's own list that are asked.
 const ASKED: usize = 3;
+/// Least share of the scene of a wall, a floor or another surface of the encoder's own list: a plate
+/// is level and flat, too.
+const LEAST_SURFACE: f64 = 0.05;
 
 /// Nouns of the levels, finest first.
 pub const NOUNS: [&str; LEVEL_NAMES.len()] = ["subpart", "part", "thing"];
@@ -69,6 +75,54 @@ pub struct Object {
     pub best_view: Option<BestView>,
 }
 
+impl Object {
+    /// Identifier, unique in the scene: level and label, "l3" or "l3.2".
+    pub fn id(&self) -> String {
+        format!("{}{}", LEVEL_NAMES[self.thing.level], self.thing.label())
+    }
+
+    /// Entry of objects.json; `views` are the names of the views.
+    pub fn record(&self, all: &[Object], views: &[String], world: &World) -> Value {
+        let instance = &self.thing.instance;
+        let metres = world.scale.as_ref().map(|scale| placement_json(instance, scale.metres_per_unit));
+        let best = self.best_view.as_ref();
+        let mut entry = placement_json(instance, 1.0);
+        entry["id"] = self.id().into();
+        entry["number"] = self.thing.number().into();
+        entry["level"] = LEVEL_NAMES[self.thing.level].into();
+        entry["parent"] = json!(self.thing.parent.and_then(|k| all.get(k)).map(Object::id));
+        entry["name"] = self.name.as_str().into();
+        entry["named"] = self.is_named.into();
+        entry["names"] = json!(self.names);
+        entry["metres"] = json!(metres);
+        entry["splats"] = instance.splats.len().into();
+        entry["share"] = instance.share.into();
+        entry["reliability"] = json!(instance.reliability);
+        entry["best_view"] = json!(best.map(|b| json!({ "view": views.get(b.view), "pixel": b.pixel })));
+        entry
+    }
+}
+
+/// Part of a picture around the visible splats of a thing, with a margin of a sixth.
+pub fn thumbnail(picture: &RgbImage, view: &BestView) -> RgbImage {
+    let [low, high] = view.bounds;
+    let range = |axis: usize, side: usize| {
+        let margin = SMALLEST_MARGIN.max((high[axis] - low[axis]) / 6.0);
+        let first = (low[axis] - margin).max(0.0) as usize;
+        let end = ((high[axis] + margin).ceil() as usize).min(side);
+        first.min(side - 1)..end.max(first + 1).min(side)
+    };
+    let (columns, rows) = (range(0, picture.width), range(1, picture.height));
+    RgbImage {
+        width: columns.len(),
+        height: rows.len(),
+        data: rows.flat_map(|y| columns.clone().map(move |x| picture.at(x, y))).collect(),
+    }
+}
+
+/// Smallest margin of a thumbnail, pixels.
+const SMALLEST_MARGIN: f64 = 6.0;
+
 /// The things of a scene in the set views of `scene`, whose cameras are `cameras`.
 ///
 /// # Errors
@@ -85,12 +139,16 @@ pub fn list(
         Some(words) => words.clone(),
         None => own_names(scene, &things)?,
     };
-    let names = named(scene, &things, &asked, progress)?;
+    let mut names = named(scene, &things, &asked, progress)?;
+    if options.vocabulary.is_none() {
+        let small = things.iter().zip(&mut names).filter(|(t, _)| t.instance.share < LEAST_SURFACE);
+        small.for_each(|(_, names)| names.retain(|name| !stuff::is_name(&name.text)));
+    }
     let objects = things.into_iter().zip(names).zip(best);
     let mut objects: Vec<Object> = objects
         .map(|((thing, names), best_view)| {
             let found = names.iter().find(|name| name.presence == Some(Presence::Found));
-            let number = format!("{} {}", NOUNS[thing.level], thing.number());
+            let number = format!("{} {}", NOUNS[thing.level], thing.label());
             let name = found.map_or(number, |found| found.text.clone());
             Object { is_named: found.is_some(), name, thing, names, best_view }
         })

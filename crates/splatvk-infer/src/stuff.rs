@@ -47,6 +47,11 @@ pub fn classes_of(name: &str) -> impl Iterator<Item = usize> {
     named.map(|(kind, _)| CLASSES + kind)
 }
 
+/// Whether a name is that of a kind, with or without a colour before it.
+pub fn is_name(text: &str) -> bool {
+    names().any(|name| text == name || text.ends_with(&format!(" {name}")))
+}
+
 /// Name of each kind.
 pub fn names() -> impl Iterator<Item = &'static str> {
     NAMES.iter().map(|names| names.split('|').next().unwrap_or_default())

@@ -126,7 +126,7 @@ pub fn write(folder: &Path, c: &Contents) -> Result<()> {
     }
     if !c.backdrop.is_empty() {
         // In its own degree: it is drawn behind the scene, not opened alone.
-        let options = ply::PlyOptions { degree: c.backdrop.sh_degree, language: None };
+        let options = ply::PlyOptions { degree: c.backdrop.sh_degree, ..ply::PlyOptions::default() };
         ply::write_splats(&folder.join(BACKDROP), c.backdrop, options)?;
     }
     let camera_folder = folder.join("cameras");
@@ -186,7 +186,7 @@ fn write_language(folder: &Path, field: &LanguageField, splats: usize) -> Result
         write_codebook(&folder.join(format!("codebook_{name}.npz")), book, &field.space)?;
         if let Some(own) = &level.splats {
             // In the scene's own degree: no other program needs to open it.
-            let options = ply::PlyOptions { degree: own.sh_degree, language: None };
+            let options = ply::PlyOptions { degree: own.sh_degree, ..ply::PlyOptions::default() };
             ply::write_splats(&own_splats(&folder, name), own, options)?;
         }
         levels.push(LevelManifest {

@@ -27,6 +27,14 @@ impl Thing {
     pub fn number(&self) -> u32 {
         ((self.group as u32) << 16) + self.code as u32 + 1
     }
+
+    /// The number for people: "5", and "5.2" for the second group of a code.
+    pub fn label(&self) -> String {
+        match self.group {
+            0 => (self.code + 1).to_string(),
+            group => format!("{}.{}", self.code + 1, group + 1),
+        }
+    }
 }
 
 impl Places {
