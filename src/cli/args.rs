@@ -203,7 +203,7 @@ pub enum ImageFormat {
 /// `splatvk render`
 #[derive(Debug, Args)]
 pub struct RenderArgs {
-    /// Scene directory, or a file of Gaussians (.ply, .splat, .spz, .glb, .gltf)
+    /// Scene directory, or a file of Gaussians (.ply, .splat, .spz, .sog, .glb, .gltf)
     pub scene: PathBuf,
     /// Cameras: transforms.json, a COLMAP model folder, or cameras.json
     #[arg(long, value_name = "FILE", required_unless_present = "path", conflicts_with = "path")]
@@ -269,8 +269,8 @@ pub struct QueryArgs {
 /// `splatvk view`
 #[derive(Debug, Args)]
 pub struct ViewArgs {
-    /// Scene directory, also one that a run is making, or a file of Gaussians (.ply, .splat, .spz,
-    /// .glb, .gltf)
+    /// Scene directory, also one that a run is making, or a file of Gaussians (.ply, .splat,
+    /// .spz, .sog, .glb, .gltf)
     pub scene: PathBuf,
     /// Port on 127.0.0.1; 0 takes a free one
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u16>(0..=65_535))]

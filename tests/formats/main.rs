@@ -4,7 +4,7 @@ mod camera_files;
 
 use glam::{DQuat, DVec3};
 use splatvk::format::npy::{self, NpyArray};
-use splatvk::format::{colmap, gaussians, ply, ply_packed, scene_dir, side_file, splat};
+use splatvk::format::{colmap, gaussians, ply, ply_packed, scene_dir, side_file, sog, splat};
 use splatvk::photo::{self, stem};
 use splatvk::scene::{
     Camera, Codebook, LanguageField, LevelField, MaskId, Pose, Seen, Splats, Up, UpEvidence, World,
@@ -242,18 +242,26 @@ fn max_difference(x: &[f32], y: &[f32]) -> f32 {
 fn packed_formats_round_trip_within_precision() {
     let folder = tempfile::tempdir().unwrap();
     for degree in 0..=3 {
-        let s = splats(700, degree);
+        let mut s = splats(700, degree);
+        // The palette of a .sog has room for fifty rows of SH, not for 700.
+        let width = 3 * s.sh_len();
+        for i in 50..700 {
+            let row = s.sh[i % 50 * width + 3..][..width - 3].to_vec();
+            s.sh[i * width + 3..][..width - 3].copy_from_slice(&row);
+        }
         let language = field(700);
         for (name, bounds) in [
             ("a.spz", [1e-6, 0.0313, 1e-5, 0.002, 0.0132]),
             ("a.compressed.ply", [1e-3, 1e-3, 1e-5, 0.002, 0.0158]),
+            ("a.sog", [2.2e-5, 0.006, 4e-5, 0.002, 0.006]),
         ] {
             let path = folder.path().join(name);
             gaussians::write(&path, &s, Some(&language)).unwrap();
             let (back, field) = gaussians::read(&path).unwrap();
-            // Row r of a compressed PLY is splat order[r].
+            // Row r of a compressed PLY or a .sog is splat order[r].
             let order = match name {
                 "a.spz" => (0..700).collect(),
+                "a.sog" => sog::write_splats(&folder.path().join("order.sog"), &s).unwrap(),
                 _ => ply_packed::write_splats(&folder.path().join("order.ply"), &s).unwrap(),
             };
             let rows: Vec<usize> =
@@ -312,11 +320,64 @@ fn splat_transform_files_are_read() {
     }
 }
 
+/// splat-transform 2.7.1 wrote `splats(24, 2)` with a palette of 16 rows, so that eight or more
+/// Gaussians have one of their own.
+#[test]
+fn sog_of_splat_transform_is_read() {
+    let minimal = gaussians::read(&data("formats/minimal.sog")).unwrap().0;
+    let plain = gaussians::read(&data("formats/minimal.splat")).unwrap().0;
+    assert!(minimal.len() == 4 && minimal.sh_degree == 0);
+    assert!(plain.means.iter().all(|m| minimal.means.iter().any(|n| max_difference(m, n) < 3e-5)));
+
+    let (back, _, notes) = gaussians::read_noted(&data("formats/sh2.sog")).unwrap();
+    let s = splats(24, 2);
+    assert!(back.len() == 24 && back.sh_degree == 2 && notes.is_empty(), "{notes:?}");
+    let nearest = |m: &[f32; 3]| {
+        let away = |i: &usize| max_difference(&back.means[*i], m);
+        (0..24).min_by(|a, b| away(a).total_cmp(&away(b))).unwrap()
+    };
+    let rows: Vec<usize> = s.means.iter().map(nearest).collect();
+    let back = back.picked(&rows);
+    let base = |s: &Splats| s.sh.chunks(27).flat_map(|row| row[..3].to_vec()).collect::<Vec<_>>();
+    let [means, scales, rotations, opacities, _] = differences(&back, &s);
+    // It rounds down where this program rounds: a whole step instead of half of one.
+    assert!(
+        means < 5e-5 && scales < 0.01 && rotations < 2e-4 && opacities < 0.004,
+        "{:?}",
+        differences(&back, &s)
+    );
+    assert!(max_difference(&base(&back), &base(&s)) < 0.01);
+    let own = |i: &usize| max_difference(&back.sh[27 * i + 3..][..24], &s.sh[27 * i + 3..][..24]) < 0.01;
+    assert!((0..24).filter(own).count() >= 8, "{}", (0..24).filter(own).count());
+
+    // The same files in a folder, and what they may not be.
+    let folder = tempfile::tempdir().unwrap();
+    let file = std::fs::File::open(data("formats/sh2.sog")).unwrap();
+    zip::ZipArchive::new(file).unwrap().extract(folder.path()).unwrap();
+    let meta = folder.path().join("meta.json");
+    assert_eq!(gaussians::read(&meta).unwrap().0.picked(&rows), back);
+    let text = std::fs::read_to_string(&meta).unwrap();
+    for (from, to, words) in [
+        ("\"version\":2", "\"version\":3", "version 3 of SOG is not known"),
+        ("\"version\":2,", "", "first version of SOG"),
+        ("\"count\":24", "\"count\":25000", "pixels for 25000"),
+        ("\"count\":24", "\"count\":99999999999", "far more than"),
+        ("means_l.webp", "../means_l.webp", "outside of its folder"),
+        ("scales.webp", "absent.webp", "absent.webp"),
+        ("\"bands\":2", "\"bands\":1", "not 192 pixels wide"),
+    ] {
+        assert!(text.contains(from), "{from}");
+        std::fs::write(&meta, text.replacen(from, to, 1)).unwrap();
+        let e = gaussians::read(&meta).unwrap_err();
+        assert!(e.exit_code() == 2 && e.to_string().contains(words), "{from} to {to}: {e}");
+    }
+}
+
 #[test]
 fn damaged_packed_files_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let s = splats(300, 1);
-    for name in ["a.spz", "a.compressed.ply", "a.splat"] {
+    for name in ["a.spz", "a.compressed.ply", "a.splat", "a.sog"] {
         let path = folder.path().join(name);
         gaussians::write(&path, &s, None).unwrap();
         let whole = std::fs::read(&path).unwrap();

@@ -182,6 +182,8 @@ pub fn all() -> Vec<Reader> {
         Reader::new("splat", seeds::gaussians("a.splat", 0), |f| gaussians_of(f, "a.splat")),
         Reader::new("spz", seeds::gaussians("a.spz", 3), |f| gaussians_of(f, "a.spz")),
         Reader::new("spz-gzip", vec![seeds::gzip("a.spz")], |f| gaussians_of(f, "a.spz")),
+        Reader::new("sog", seeds::sog("a.sog"), |f| gaussians_of(f, "a.sog")),
+        Reader::new("sog-folder", seeds::sog_folder(), |f| gaussians_of(f, "meta.json")),
         Reader::new("glb", seeds::glb("a.glb"), |f| gaussians_of(f, "a.glb")),
         Reader::new("gltf", seeds::gltf(), |f| gaussians_of(f, "a.gltf")),
         Reader::new("language", seeds::language(), |f| gaussians_of(f, "a.splat")),

@@ -136,6 +136,39 @@ pub fn gzip(name: &str) -> Seed {
     })
 }
 
+/// Members of an archive by name.
+fn members(bytes: &[u8]) -> Vec<(String, Vec<u8>)> {
+    let mut archive = zip::ZipArchive::new(Cursor::new(bytes)).unwrap();
+    (0..archive.len())
+        .map(|k| {
+            let mut member = archive.by_index(k).unwrap();
+            let mut bytes = Vec::new();
+            member.read_to_end(&mut bytes).unwrap();
+            (member.name().unwrap().to_string(), bytes)
+        })
+        .collect()
+}
+
+/// Damages meta.json inside of the archive.
+pub fn sog(name: &'static str) -> Vec<Seed> {
+    let container: Container = |bytes, change| {
+        let mut out = zip::ZipWriter::new(Cursor::new(Vec::new()));
+        let options = zip::write::SimpleFileOptions::default();
+        for (name, content) in members(bytes) {
+            out.start_file(&name, options).unwrap();
+            let content = if name == "meta.json" { change(&content) } else { content };
+            out.write_all(&content).unwrap();
+        }
+        out.finish().unwrap().into_inner()
+    };
+    gaussians(name, 1).into_iter().map(|s| Seed { container: Some(container), ..s }).collect()
+}
+
+/// A .sog as files of a folder, all of which are damaged.
+pub fn sog_folder() -> Vec<Seed> {
+    members(&gaussians("a.sog", 2)[0].bytes).into_iter().map(|(name, bytes)| file(&name, bytes)).collect()
+}
+
 /// Damages the JSON document, with corrected lengths.
 pub fn glb(name: &'static str) -> Vec<Seed> {
     let container: Container = |bytes, change| {

@@ -9,6 +9,7 @@ mod ply_header;
 pub mod ply_packed;
 mod ply_points;
 mod ply_table;
+pub mod sog;
 pub mod splat;
 pub mod spz;
 mod spz_extensions;
@@ -54,7 +55,7 @@ impl Default for WriteOptions {
 }
 
 /// All formats; an ending stands before its own suffixes (".compressed.ply" before ".ply").
-pub static FORMATS: [SplatFormat; 6] = [
+pub static FORMATS: [SplatFormat; 7] = [
     SplatFormat {
         name: "compressed-ply",
         about: "compressed .ply, as SuperSplat writes it",
@@ -96,6 +97,16 @@ pub static FORMATS: [SplatFormat; 6] = [
         write: |path, s, options| spz::write_splats(path, s, options.spz_version).map(|()| Vec::new()),
     },
     SplatFormat {
+        name: "sog",
+        about: ".sog of PlayCanvas, the smallest",
+        ending: ".sog",
+        brightest: None,
+        y_up: false,
+        states_filter: true,
+        read: sog::read_noted,
+        write: |path, s, _| sog::write_splats(path, s),
+    },
+    SplatFormat {
         name: "glb",
         about: "glTF with KHR_gaussian_splatting, binary",
         ending: ".glb",
@@ -134,6 +145,14 @@ pub fn is_named(path: &Path) -> bool {
     find(path).is_some()
 }
 
+/// Format by the name of a file that is read: unpacked, a `.sog` is a `meta.json` with images.
+fn readable(path: &Path) -> Result<&'static SplatFormat> {
+    match SplatFormat::named("sog") {
+        Some(sog) if path.file_name().is_some_and(|name| name == sog::META) => Ok(sog),
+        _ => format(path),
+    }
+}
+
 /// Format by the ending of a file's name.
 pub fn format(path: &Path) -> Result<&'static SplatFormat> {
     find(path).ok_or_else(|| {
@@ -156,7 +175,7 @@ pub fn read(path: &Path) -> Result<(Splats, Option<LanguageField>)> {
 
 /// Like [`read`]; also returns notes on parts that were left out or not applied, a line each.
 pub fn read_noted(path: &Path) -> Result<(Splats, Option<LanguageField>, Vec<String>)> {
-    let format = format(path)?;
+    let format = readable(path)?;
     if let Some(e) = other::misnamed(path, format.name, format.ending) {
         return Err(e);
     }

@@ -1,4 +1,5 @@
 //! File formats and the scene directory.
+mod archive;
 mod camera_file;
 pub mod cameras;
 pub mod colmap;
@@ -19,5 +20,5 @@ mod workspace;
 pub use camera_file::CameraFile;
 pub use common::logit;
 pub use common::{create_folder, to_byte, write_json, write_whole_file};
-pub use gaussians::{gltf, ply, ply_packed, splat, spz};
+pub use gaussians::{gltf, ply, ply_packed, sog, splat, spz};
 pub use workspace::{Replaced, Workspace};

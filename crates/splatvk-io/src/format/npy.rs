@@ -1,9 +1,10 @@
 //! NumPy `.npy` (format versions 1–3) and `.npz` files: little-endian, C order.
+use super::archive;
 use crate::{Error, Result, files};
 use half::f16;
 use std::cmp::Ordering;
 use std::collections::BTreeMap;
-use std::io::{Cursor, Read, Write};
+use std::io::{Cursor, Read};
 use std::path::Path;
 
 const MAGIC: &[u8] = b"\x93NUMPY";
@@ -218,20 +219,9 @@ pub fn write_packed_npz(path: impl AsRef<Path>, arrays: &[(&str, &NpyArray)]) ->
     write_zip(path.as_ref(), arrays, zip::CompressionMethod::Deflated)
 }
 
-/// Writes an archive through memory: with a full disk, a `ZipWriter` continues to write when it is
-/// dropped, prints the resulting errors itself, and may panic at an invalid position.
 fn write_zip(path: &Path, arrays: &[(&str, &NpyArray)], method: zip::CompressionMethod) -> Result<()> {
-    let failed = |e: &dyn std::fmt::Display| {
-        Error::work(format!("{}: cannot write the npz file: {e}", path.display()))
-    };
-    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
-    let options = zip::write::SimpleFileOptions::default().compression_method(method);
-    for (name, array) in arrays {
-        zip.start_file(format!("{name}.npy"), options).map_err(|e| failed(&e))?;
-        zip.write_all(&encode(array)?).map_err(|e| failed(&e))?;
-    }
-    let bytes = zip.finish().map_err(|e| failed(&e))?.into_inner();
-    std::fs::write(path, bytes).map_err(Error::unwritable(path))
+    let members = arrays.iter().map(|(name, array)| Ok((format!("{name}.npy"), encode(array)?)));
+    archive::write(path, "npz", method, members)
 }
 
 /// Serialises an array as a `.npy` file image.
@@ -388,6 +378,7 @@ fn parse_values(descr: &str, bytes: &[u8]) -> NpyData {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::io::Write;
 
     #[cfg(target_os = "linux")]
     #[test]

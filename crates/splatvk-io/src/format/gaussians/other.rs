@@ -1,12 +1,12 @@
 //! Files whose format differs from their name, or is not supported: detection and advice.
+use super::sog;
 use crate::{Error, files};
 use std::io::Read as _;
 use std::path::Path;
 
 /// Endings of other programs' files, with advice.
-const OTHERS: [(&str, &str); 14] = [
+const OTHERS: [(&str, &str); 13] = [
     (".ksplat", "a .ksplat is of GaussianSplats3D: export the .ply that it was made from"),
-    (".sog", "a .sog is of PlayCanvas: splat-transform turns it into a .ply"),
     (".lcc", "an .lcc is of XGRIDS: splat-transform turns it into a .ply"),
     (".rad", "a .rad is of Spark: give the .ply or .spz that it was made from"),
     (".usdz", "export the Gaussians of a .usdz as .ply"),
@@ -16,7 +16,7 @@ const OTHERS: [(&str, &str); 14] = [
     (".html", "a page cannot be read: give the file that it shows"),
     (
         ".json",
-        "a meta.json of PlayCanvas becomes a .ply with splat-transform; a nerfstudio folder, with ns-export",
+        "a lod-meta.json of PlayCanvas becomes a .ply with splat-transform; a nerfstudio folder, with ns-export",
     ),
     (
         ".ckpt",
@@ -42,9 +42,19 @@ fn content(path: &Path) -> Option<&'static str> {
         [b'p', b'l', b'y', b'\n' | b'\r' | b' ', ..] => "ply",
         [0x1f, 0x8b, ..] | [b'N', b'G', b'S', b'P', ..] => "spz",
         [b'g', b'l', b'T', b'F', ..] => "glb",
+        [b'P', b'K', 3, 4, ..] if is_sog(path) => "sog",
         _ => return None,
     };
     Some(name)
+}
+
+/// Whether an archive contains the description of a `.sog`.
+fn is_sog(path: &Path) -> bool {
+    let names = || {
+        let archive = zip::ZipArchive::new(files::open(path).ok()?.0).ok()?;
+        archive.index_for_name(sog::META)
+    };
+    matches!(files::guarded(names), Ok(Some(_)))
 }
 
 /// Error for a file whose content is of another format than `format` with `ending`.
@@ -70,8 +80,7 @@ mod tests {
     fn other_formats_are_refused_with_advice() {
         for (name, words) in [
             ("a.ksplat", "GaussianSplats3D"),
-            ("a.SOG", "splat-transform"),
-            ("meta.json", "splat-transform"),
+            ("lod-meta.json", "splat-transform"),
             ("a.usdz", "as .ply"),
             ("a.xyz", "one of these formats"),
         ] {
@@ -85,7 +94,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let splats = seeded::small(9, 32, 24, 0, 1001).0;
         for format in FORMATS.iter().filter(|f| !["splat", "gltf"].contains(&f.name)) {
-            for name in ["a.ply", "a.spz", "a.glb", "a.splat"] {
+            for name in ["a.ply", "a.spz", "a.glb", "a.splat", "a.sog"] {
                 let path = folder.path().join(name);
                 write_as(&path, &splats, None, format, WriteOptions::default()).unwrap();
                 match read_noted(&path) {

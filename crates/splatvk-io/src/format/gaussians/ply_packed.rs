@@ -210,7 +210,7 @@ fn bounded_values(s: &Splats, i: usize) -> [f32; 9] {
 }
 
 /// Indices in Morton order, ten bits per axis.
-fn morton_order(means: &[[f32; 3]]) -> Vec<u32> {
+pub(super) fn morton_order(means: &[[f32; 3]]) -> Vec<u32> {
     let mut low = [f32::INFINITY; 3];
     let mut high = [f32::NEG_INFINITY; 3];
     for m in means {
