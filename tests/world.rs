@@ -109,6 +109,75 @@ fn export_up_turns_scene() {
     assert!(!folder.path().join("b.spz").exists());
 }
 
+/// `{files, up, metres, splats, guessed, summary}` of an export into `folder`.
+fn exported(scene: &Path, folder: &Path, arguments: &[&str]) -> serde_json::Value {
+    let mut export = splatvk();
+    export.current_dir(folder).arg("export").arg(scene).args(arguments).args(["--force", "--json"]);
+    let output = export.output().unwrap();
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let told: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let line = told["summary"].as_str().unwrap();
+    assert!(text(&output.stderr).lines().any(|l| l == line), "{line}: {}", text(&output.stderr));
+    told
+}
+
+#[test]
+fn export_is_upright_in_metres_by_default() {
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, splats, camera) = tilted_scene(folder.path());
+    let mean = |at: &[f32; 3]| glam::Vec3::from_array(*at).as_dvec3();
+    let read = |name: &str| splatvk::format::gaussians::read(&folder.path().join(name)).unwrap().0;
+    // Up is known, metres are not.
+    let told = exported(&scene, folder.path(), &["a.ply", "--guessed"]);
+    assert_eq!((&told["up"]["axis"], &told["metres"]), (&"-y".into(), &serde_json::Value::Null), "{told}");
+    assert_eq!((&told["files"][0], &told["splats"]), (&"a.ply".into(), &2.into()));
+    let summary = told["summary"].as_str().unwrap();
+    for words in ["upright (−y is up, ±1.0°)", "own unit", "measure --scale", "2 splats, 1 of them guessed"]
+    {
+        assert!(summary.contains(words), "{words}: {summary}");
+    }
+    assert!((mean(&read("a.ply").means[0]) - glam::DVec3::NEG_Y).length() < 1e-6);
+    // Metres are known, too. A format with y up is read back with −y up, as the others are.
+    measure_json(&scene, &["--scale", "0,0,2 - -2,0,2 = 50cm"]);
+    for (name, axis) in [("a.ply", "-y"), ("a.splat", "-y"), ("a.spz", "y"), ("a.glb", "y")] {
+        let told = exported(&scene, folder.path(), &[name, "--guessed"]);
+        assert_eq!(told["up"]["axis"], axis, "{name}");
+        assert_eq!(told["metres"]["metres_per_unit"], 0.25, "{name}");
+        let up = mean(&read(name).means[0]);
+        assert!((up - 0.25 * glam::DVec3::NEG_Y).length() < 1e-5, "{name}: {up}");
+    }
+    let told = exported(&scene, folder.path(), &["a.ply"]);
+    assert!(told["summary"].as_str().unwrap().contains("1 splat; 1 that no photo shows left out: --guessed"));
+    // Cameras and points fit the splats.
+    let told = exported(&scene, folder.path(), &["t.json"]);
+    assert_eq!((&told["cameras"], &told["up"]["axis"]), (&1.into(), &"-y".into()), "{told}");
+    assert_eq!(exported(&scene, folder.path(), &["model", "--format", "colmap"])["points"], 2);
+    let placed = splatvk::format::cameras::read(&folder.path().join("t.json")).unwrap();
+    let (before, after) =
+        (camera.project(mean(&splats.means[1])), placed[0].project(mean(&read("a.spz").means[1])));
+    assert!((before.0 - after.0).length() < 1e-2, "{before:?} {after:?}");
+    let points = splatvk::format::colmap::read_points(&folder.path().join("model")).unwrap().positions;
+    assert!((mean(&points[0]) - 0.25 * glam::DVec3::NEG_Y).length() < 1e-6, "{points:?}");
+    // The scene's own axes and unit, or one of the two.
+    let told = exported(&scene, folder.path(), &["raw.ply", "--guessed", "--raw"]);
+    assert!(told["up"].is_null() && told["metres"].is_null(), "{told}");
+    assert!(told["summary"].as_str().unwrap().starts_with("in the scene's own axes and unit, 2 splats"));
+    assert_eq!(read("raw.ply").means, splats.means);
+    let told = exported(&scene, folder.path(), &["raw.ply", "--guessed", "--raw", "--up", "z"]);
+    assert!(told["metres"].is_null() && told["up"]["axis"] == "z", "{told}");
+    assert!((mean(&read("raw.ply").means[0]) - glam::DVec3::Z).length() < 1e-6);
+    // A file of Gaussians states neither.
+    let told = exported(&folder.path().join("a.ply"), folder.path(), &["copy.spz"]);
+    assert!(told["up"].is_null() && told["summary"].as_str().unwrap().contains("states neither"), "{told}");
+    let mut both = splatvk();
+    refuses(
+        both.arg("export").arg(&scene).args(["b.ply", "--out", "c.ply"]),
+        2,
+        &["cannot be used together"],
+    );
+    refuses(splatvk().arg("export").arg(&scene), 2, &["FILE"]);
+}
+
 #[test]
 fn export_omits_unseen() {
     let folder = tempfile::tempdir().unwrap();
@@ -147,7 +216,7 @@ fn measure_scale_sets_metres() {
         export
             .arg("export")
             .arg(&scene)
-            .args(["--format", "ply", "--metres", "--guessed", "--out"])
+            .args(["--format", "ply", "--raw", "--metres", "--guessed", "--out"])
             .arg(folder.path().join(name));
         export
     };

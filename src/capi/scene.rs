@@ -336,8 +336,9 @@ fn instance(i: &Instance) -> SvkInstance {
 
 /// Writes the scene to `path`.
 ///
-/// A path that ends in .ply, .compressed.ply, .splat, .spz, .glb or .gltf becomes a file of
-/// Gaussians, with the language beside it in NAME.language.npz. A path without an ending, with a
+/// A path that ends in .ply, .compressed.ply, .splat, .spz, .sog, .glb or .gltf becomes a file of
+/// Gaussians in the axes and the unit of the scene (.spz and glTF with y and z reversed, since they
+/// have y up), with the language beside it in NAME.language.npz. A path without an ending, with a
 /// final slash, or of a folder becomes a scene directory. Any other ending is SVK_STATUS_INPUT.
 ///
 /// The output appears complete or not at all. With `replace` = 1 it may replace a scene or a file,

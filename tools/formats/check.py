@@ -289,7 +289,7 @@ def matrices():
 def cameras():
     expected = matrices()
     for kind in ("colmap", "colmap-bin"):
-        run("export", SCENE, "--format", kind, "--out", WORK / kind)
+        run("export", SCENE, "--raw", "--format", kind, "--out", WORK / kind)
         model = pycolmap.Reconstruction(str(WORK / kind))
         assert model.num_images() == len(expected) and model.num_points3D() > 100
         for image in model.images.values():
@@ -297,7 +297,7 @@ def cameras():
             close(f"{kind} pose", image.cam_from_world().matrix(), m[:3], 1e-9)
             close(f"{kind} intrinsics", image.camera.params, intrinsics, 1e-9)
         print(f"ok  {kind}: pycolmap")
-    run("export", SCENE, "--format", "transforms", "--out", WORK / "transforms.json")
+    run("export", SCENE, "--raw", "--format", "transforms", "--out", WORK / "transforms.json")
     # What pycolmap writes is read by splatvk: the same pictures come out.
     model = pycolmap.Reconstruction(str(WORK / "colmap-bin"))
     for kind in ("text", "binary"):
@@ -347,7 +347,7 @@ def images():
 def language():
     """Features travel with their splats through a format that sorts them."""
     out = WORK / "scene.compressed.ply"
-    run("export", SCENE, "--format", "compressed-ply", "--out", out)
+    run("export", SCENE, "--raw", "--format", "compressed-ply", "--out", out)
     side = np.load(str(out) + ".language.npz")
     features = np.load(SCENE / "language/features.npz")
     whole, packed = read_ply(SCENE / "point_cloud.ply"), of_gsply(gsply.plyread(str(out)))

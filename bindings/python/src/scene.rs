@@ -314,8 +314,9 @@ impl Scene {
         }
         Ok(Scene::of(self.on_device(py, |live| live.picked(&rows))?, None))
     }
-    /// Writes a file of Gaussians in the format of its ending (.ply, .spz, .glb, ...), or a scene
-    /// directory where there is no ending. Existing ones are replaced only with `force`.
+    /// Writes a file of Gaussians in the format of its ending (.ply, .spz, .sog, .glb, ...), or a
+    /// scene directory where there is no ending. Files keep the axes and the unit of the scene, as
+    /// with `splatvk export --raw`. Existing ones are replaced only with `force`.
     #[pyo3(signature = (path, force = false))]
     fn save(&self, py: Python<'_>, path: PathBuf, force: bool) -> PyResult<()> {
         self.on_device(py, |live| live.save(&path, force))?;

@@ -176,7 +176,7 @@ impl PlannedRow<'_> {
             let folder = out.join("exports");
             std::fs::create_dir(&folder).map_err(Error::unwritable(&folder))?;
         }
-        exports.iter().try_for_each(export::write)?;
+        exports.iter().try_for_each(|args| export::write(args).map(drop))?;
         let mut written = Vec::new();
         digest(out, &mut written)?;
         written.sort();
