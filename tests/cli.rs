@@ -477,6 +477,28 @@ fn run_scene_renders_exports_and_answers() {
         assert!(export.output().unwrap().status.success(), "{format}");
         assert!(folder.path().join(name).exists());
     }
+    // The view as one page.
+    let mut page = splatvk();
+    page.arg("export").arg(scene()).arg(folder.path().join("p.html")).args([
+        "--title",
+        "A <b> & c",
+        "--json",
+    ]);
+    let output = page.output().unwrap();
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let told: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let html = std::fs::read_to_string(folder.path().join("p.html")).unwrap();
+    assert!(html.contains("<h1>A &lt;b&gt; &amp; c</h1>") && html.contains("id=\"v-splats\""));
+    assert!(!html.contains("http:") && !html.contains("https:"), "nothing is fetched");
+    let shown = told["splats"].as_u64().unwrap();
+    assert!(shown > 1000 && html.matches("data:image/jpeg;base64,").count() == 2, "{told}");
+    let page = |options: &[&str]| {
+        let mut page = splatvk();
+        page.arg("export").arg(scene()).arg(folder.path().join("q.html")).args(options);
+        page
+    };
+    refuses(&mut page(&["--up", "z"]), 2, &["opens upright", "--up"]);
+    refuses(&mut page(&["--format", "ply", "--title", "x"]), 2, &["--title"]);
     // The same scene, as if no photo showed its first hundred splats.
     let guessed = tempfile::tempdir().unwrap();
     std::fs::create_dir(guessed.path().join("cameras")).unwrap();
@@ -494,7 +516,7 @@ fn run_scene_renders_exports_and_answers() {
     let kept = splatvk::format::ply::read_splats(&folder.path().join("a.ply")).unwrap();
     assert!((100..all.pixels.len() / 2).contains(&all.unseen()), "{}", all.unseen());
     assert_eq!(kept.len(), all.pixels.len() - all.unseen());
-    assert_eq!(names(folder.path()), ["a.ply", "a.splat", "model", "renders", "t.json"]);
+    assert_eq!(names(folder.path()), ["a.ply", "a.splat", "model", "p.html", "renders", "t.json"]);
     let mut nothing = splatvk();
     nothing
         .arg("render")

@@ -1,16 +1,18 @@
 //! `splatvk export`
 mod losses;
 mod output;
+mod page;
 mod placement;
 
 pub use output::{format, is_folder};
 
-use super::print::{print, print_json, thousands};
+use super::print::{print, print_json};
 use super::progress;
 use super::scene;
 use crate::format::gaussians::{FORMATS, WriteOptions};
 use crate::format::scene_dir::Scene;
 use crate::format::{colmap, ply, spz, transforms};
+use crate::report::thousands;
 use crate::scene::{Camera, UpAxis};
 use crate::{Error, Result};
 use clap::Args;
@@ -43,14 +45,19 @@ pub struct ExportArgs {
     /// ply: spherical-harmonics degree of the file, padded with zeros; most viewers ask for 3
     #[arg(long, default_value_t = 3, value_parser = super::args::whole::<u32>(0..=3), value_name = "0-3")]
     pub ply_degree: u32,
-    /// spz: version of the file; 3 is read by most programs, 4 by the newest ones only
+    /// spz: version of the file; 3 is read by Niantic, SuperSplat, three.js, Spark and Babylon.js, 4
+    /// by SuperSplat, three.js and PlayCanvas (its only one), not by Spark; 2 by older ones
+    /// [default: 3]
     #[arg(long, value_parser = clap::value_parser!(u32).range(2..=4), value_name = "2-4")]
     pub spz_version: Option<u32>,
     /// ply: add the language features and codes as extra columns
     #[arg(long)]
     pub with_features: bool,
+    /// html: heading of the page [default: name of the scene]
+    #[arg(long, value_name = "TEXT")]
+    pub title: Option<String>,
     /// Keep what no photo shows: surfaces continued beyond the photos and behind what stands in
-    /// front, and the blurred colours behind the scene
+    /// front, and the blurred colours behind the scene (html: the page has them, key G hides them)
     #[arg(long)]
     pub guessed: bool,
     /// The default since guessed surfaces are left out; kept for scripts.
@@ -83,18 +90,19 @@ impl ExportArgs {
 
 fn formats() -> PossibleValuesParser {
     let splats = FORMATS.iter().map(|f| PossibleValue::new(f.name).help(f.about));
-    let cameras = [
+    let others = [
+        ("html", "the interactive view as one page, to look at and to send"),
         ("colmap", "COLMAP text model"),
         ("colmap-bin", "COLMAP binary model"),
         ("transforms", "nerfstudio transforms.json"),
     ];
-    PossibleValuesParser::new(splats.chain(cameras.map(|(name, about)| PossibleValue::new(name).help(about))))
+    PossibleValuesParser::new(splats.chain(others.map(|(name, about)| PossibleValue::new(name).help(about))))
 }
 
-/// A finished export.
+/// A finished export: one line on what was done, also as the `summary` of a JSON object.
 pub struct Exported {
-    placement: Placement,
-    content: Content,
+    text: String,
+    json: Value,
 }
 
 /// Written things.
@@ -106,9 +114,31 @@ enum Content {
 }
 
 impl Exported {
-    /// One line on what was done.
+    fn new(text: String, mut json: Value) -> Exported {
+        json["summary"] = text.as_str().into();
+        Exported { text, json }
+    }
+
+    fn placed(placement: &Placement, content: &Content) -> Exported {
+        let text = format!("{}, {}", placement.text(), content.text());
+        let mut json = placement.json();
+        match *content {
+            Content::Splats { written, left_out, kept } => {
+                json["splats"] = written.into();
+                json["guessed"] = json!({ "left_out": left_out, "kept": kept });
+            }
+            Content::Cameras { cameras, points } => {
+                json["cameras"] = cameras.into();
+                json["points"] = points.into();
+            }
+        }
+        Exported::new(text, json)
+    }
+}
+
+impl Content {
     fn text(&self) -> String {
-        let content = match self.content {
+        match *self {
             Content::Splats { written, left_out: 0, kept: 0 } => counted(written, "splat"),
             Content::Splats { written, left_out: 0, kept } => {
                 format!("{}, {} of them guessed", counted(written, "splat"), thousands(kept))
@@ -122,24 +152,7 @@ impl Exported {
             Content::Cameras { cameras, points: Some(points) } => {
                 format!("{}, {}", counted(cameras, "camera"), counted(points, "point"))
             }
-        };
-        format!("{}, {content}", self.placement.text())
-    }
-
-    fn json(&self) -> Value {
-        let mut told = self.placement.json();
-        match self.content {
-            Content::Splats { written, left_out, kept } => {
-                told["splats"] = written.into();
-                told["guessed"] = json!({ "left_out": left_out, "kept": kept });
-            }
-            Content::Cameras { cameras, points } => {
-                told["cameras"] = cameras.into();
-                told["points"] = points.into();
-            }
         }
-        told["summary"] = self.text().into();
-        told
     }
 }
 
@@ -149,9 +162,9 @@ fn counted(n: usize, noun: &str) -> String {
 
 pub fn export(args: &ExportArgs) -> Result<()> {
     let done = write(args)?;
-    progress::reporter().inform(&done.text());
+    progress::reporter().inform(&done.text);
     if args.json {
-        let mut told = done.json();
+        let mut told = done.json;
         told["files"] = json!([args.place()]);
         return print_json(&told);
     }
@@ -161,8 +174,17 @@ pub fn export(args: &ExportArgs) -> Result<()> {
 /// Writes the file or the folder of an export.
 pub fn write(args: &ExportArgs) -> Result<Exported> {
     let format = format(args)?;
+    if format == "html" {
+        page::check(args)?;
+    } else if args.title.is_some() {
+        return Err(Error::input("--title: only --format html has a heading; leave it out"));
+    }
     let out = Output::reserve(args, format)?;
     let mut scene = scene::load(&args.scene)?;
+    let out = match out {
+        Output::File(file) if format == "html" => return page::write(args, &scene, file),
+        other => other,
+    };
     let content = select(&mut scene, args.guessed);
     let placement = Placement::new(&scene, args, format)?;
     let mut points = match is_folder(format) {
@@ -215,7 +237,7 @@ pub fn write(args: &ExportArgs) -> Result<Exported> {
     if let Some(warning) = check_ending(args.place(), format)? {
         progress::reporter().warn(&warning);
     }
-    Ok(Exported { placement, content })
+    Ok(Exported::placed(&placement, &content))
 }
 
 /// Drops the splats that no photo shows, or adds those behind the scene.

@@ -39,22 +39,9 @@ pub fn listing(files: &[std::path::PathBuf], as_json: bool) -> Result<()> {
     print(&files.iter().map(|f| format!("{}\n", f.display())).collect::<String>())
 }
 
-/// A number in groups of three digits: 80,123.
-pub fn thousands(n: usize) -> String {
-    let digits = n.to_string();
-    let groups: Vec<&[u8]> = digits.as_bytes().rchunks(3).rev().collect();
-    String::from_utf8_lossy(&groups.join(&b',')).into_owned()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn thousands_are_grouped() {
-        let told = [0, 999, 1000, 80_123, 1_000_001].map(thousands);
-        assert_eq!(told, ["0", "999", "1,000", "80,123", "1,000,001"]);
-    }
 
     #[test]
     fn ending_quotes_paths_for_shell() {

@@ -5,9 +5,7 @@ use super::progress;
 use super::scene;
 use super::serve::{Answer, ServerAddress, Site, serve};
 use crate::format::scene_dir::Scene;
-use crate::format::scene_photos;
 use crate::gpu;
-use crate::photo;
 use crate::query::QueryOptions;
 use crate::report::viewer::{self, CodeNames, Lifetime, SCENE_PATH, Scene3d};
 use crate::run::Compat;
@@ -15,7 +13,6 @@ use crate::run::ask::QueryScene;
 use crate::run::encoder;
 use crate::run::preview;
 use crate::run::record;
-use crate::scene::{Camera, RgbImage};
 use crate::{Error, Result};
 use serde_json::json;
 use std::path::Path;
@@ -201,12 +198,7 @@ fn page(
     suggested: Vec<String>,
     (no_questions, lifetime): (Option<&str>, Lifetime),
 ) -> Result<String> {
-    // Photos are optional: a scene without its images, or with images elsewhere, is still shown.
-    let load = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
-    let photos: Option<Vec<_>> = scene.cameras.iter().map(load).collect();
-    let images: Vec<RgbImage> = photos.unwrap_or_default().into_iter().map(|p| p.image).collect();
-    let path = path.canonicalize().unwrap_or_else(|_| path.to_owned());
-    let title = path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+    let (images, title) = (scene::photos(scene), scene::title(path));
     let view = Scene3d {
         title: &title,
         splats: &scene.splats,

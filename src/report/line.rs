@@ -39,9 +39,22 @@ pub fn visible(c: char) -> char {
     if c.is_control() || turns { '\u{fffd}' } else { c }
 }
 
+/// A number in groups of three digits: 80,123.
+pub fn thousands(n: usize) -> String {
+    let digits = n.to_string();
+    let groups: Vec<&[u8]> = digits.as_bytes().rchunks(3).rev().collect();
+    String::from_utf8_lossy(&groups.join(&b',')).into_owned()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn thousands_are_grouped() {
+        let told = [0, 999, 1000, 80_123, 1_000_001].map(thousands);
+        assert_eq!(told, ["0", "999", "1,000", "80,123", "1,000,001"]);
+    }
 
     #[test]
     fn one_line_limits_length_and_characters() {

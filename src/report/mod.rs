@@ -14,7 +14,7 @@ pub use contents::{
     AnswerShown, Certainty, Curve, Figure, HtmlReport, ModelUsed, QueryShown, RunRecord, ViewShown,
 };
 pub use html::write_html;
-pub use line::{one_line, shell_quoted, visible};
+pub use line::{one_line, shell_quoted, thousands, visible};
 pub use summary::{duration, table};
 
 pub use crate::progress::StageRecord;

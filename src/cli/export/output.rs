@@ -10,7 +10,7 @@ use std::path::Path;
 pub(super) enum Output {
     /// The files of a COLMAP model.
     Folder(WrittenFiles),
-    /// One file: cameras, or a PLY, the only format with language inside and any SH degree.
+    /// One file: cameras, a page, or a PLY, the only format with language inside and any SH degree.
     File(WrittenFile),
     /// Splats, with the language beside them.
     Splats(Reserved, &'static SplatFormat),
@@ -52,7 +52,7 @@ impl Output {
 
 /// Formats with a file ending: (name, ending).
 fn endings() -> impl Iterator<Item = (&'static str, &'static str)> {
-    FORMATS.iter().map(|f| (f.name, f.ending)).chain([("transforms", ".json")])
+    FORMATS.iter().map(|f| (f.name, f.ending)).chain([("transforms", ".json"), ("html", ".html")])
 }
 
 /// Whether a format is a folder of files.

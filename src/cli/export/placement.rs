@@ -101,7 +101,7 @@ impl Placement {
 
     /// Statement of the axes and of the unit.
     pub(super) fn text(&self) -> String {
-        let turned = if self.y_up { ", right, up, back" } else { "" };
+        let turned = if self.y_up { " (as right, up, back)" } else { "" };
         let upright = self.up.as_ref().map(|(axis, up)| {
             let axis = match axis {
                 UpAxis::MinusY => "−y",

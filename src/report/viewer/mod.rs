@@ -7,7 +7,8 @@ mod pack;
 
 pub use pack::{Packed, pack};
 
-use super::colour;
+use super::chart::escape;
+use super::{colour, thousands};
 use crate::Result;
 use crate::format::picture;
 use crate::query::clicks::Standing;
@@ -45,6 +46,9 @@ const MODULES: [(&str, &str); 13] = [
 ];
 
 const MARKUP: &str = include_str!("viewer.html");
+
+/// Beginning of the upper row of the section.
+const TOP: &str = "<div class=\"v-top\">";
 
 /// Style sheet of the section.
 pub const STYLE: &str = include_str!("viewer.css");
@@ -110,6 +114,17 @@ pub struct Scene3d<'a> {
     pub suggested: Vec<String>,
 }
 
+/// A page for presentation.
+#[derive(Clone, Debug)]
+pub struct Presented {
+    /// Text of the file.
+    pub html: String,
+    /// Number of splats in it.
+    pub shown: usize,
+    /// Number of splats of the scene, those behind it included.
+    pub total: usize,
+}
+
 /// Content of a served page that may change while it is open.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Lifetime {
@@ -136,6 +151,24 @@ impl Scene3d<'_> {
         Ok((section(&manifest, &splats), note))
     }
 
+    /// Whole page with the splats inside, under its title.
+    pub fn presented(&self) -> Result<Presented> {
+        let packed = pack(self.splats, self.seen, self.backdrop, self.language, REPORT_SPLATS)?;
+        let mut manifest = self.manifest("")?;
+        manifest["presented"] = true.into();
+        let data = STANDARD.encode(&packed.bytes);
+        let splats = format!("<script type=\"text/plain\" id=\"v-splats\">{data}</script>");
+        let (shown, total) = (thousands(packed.shown), thousands(packed.total));
+        let caption = format!(
+            "<header class=\"v-caption\"><h1>{}</h1><p>{shown} of {total} splats, {:.1} MB</p></header>",
+            escape(self.title),
+            data.len() as f64 / 1e6
+        );
+        let html = self.whole_page(&manifest, &splats);
+        let html = html.replacen(TOP, &format!("{TOP}{caption}"), 1);
+        Ok(Presented { html, shown: packed.shown, total: packed.total })
+    }
+
     /// Whole page with at most `most` splats inside, for a frame in another page; with `asks` it
     /// sends questions to that page, which answers them.
     pub fn framed(&self, most: usize, asks: bool) -> Result<String> {
@@ -160,7 +193,7 @@ impl Scene3d<'_> {
     }
 
     fn whole_page(&self, manifest: &Value, splats: &str) -> String {
-        let title = super::chart::escape(self.title);
+        let title = escape(self.title);
         format!(
             "<!doctype html><html lang=\"en\"><meta charset=\"utf-8\"><meta name=\"viewport\" \
              content=\"width=device-width, initial-scale=1, viewport-fit=cover\"><title>{title} · splatvk</title>\
@@ -284,6 +317,9 @@ mod tests {
         assert!(page.contains("\"renews\":true") && page.contains("\"suggested\":[\"mug\"]"));
         let framed = scene.framed(10, true).unwrap();
         assert!(framed.contains("id=\"v-splats\"") && framed.contains("\"framed\":true"));
+        let shown = scene.presented().unwrap();
+        assert!(shown.html.contains("<h1>a&lt;b</h1><p>") && shown.html.contains("\"presented\":true"));
+        assert!(shown.shown > 0 && shown.shown <= shown.total && shown.total == splats.len());
         let last = scene.served(None, Lifetime::Final).unwrap();
         assert!(last.contains("\"live\":true") && last.contains("\"renews\":false"));
         // Every imported module exists.

@@ -209,7 +209,7 @@ const modes = [
   { name: "Colour", mode: "colour" },
   { name: "Depth", mode: "depth" },
   ...levels.flatMap((l, level) => (l.colours.length ? [{ name: l.title, mode: "level", level }] : [])),
-  ...(levels.some((l) => l.colours.length) ? [{ name: "Relevancy", mode: "relevancy" }] : []),
+  ...(!manifest.presented && levels.some((l) => l.colours.length) ? [{ name: "Relevancy", mode: "relevancy" }] : []),
   ...(manifest.unseen ? [{ name: "Guessed", mode: "unseen", title: "What no photo shows, in magenta" }] : []),
 ];
 
@@ -493,7 +493,7 @@ function connect() {
     e.preventDefault();
     ask(form.elements.text.value);
   };
-  form.hidden = find(".v-chips").hidden = !levels.some((l) => l.colours.length);
+  form.hidden = find(".v-chips").hidden = manifest.presented || !levels.some((l) => l.colours.length);
   form.elements.text.placeholder = manifest.live ? "Ask for something you see" : "Queries of the run";
   listQueries();
   const toView = (act) => (...given) => (root.scrollIntoView({ block: "nearest" }), act(...given));

@@ -13,7 +13,7 @@ use std::path::Path;
 /// Most entries of the palette: its indices have 16 bits.
 const MOST_ENTRIES: usize = 1 << 16;
 /// Gaussians per entry of the palette.
-const PER_ENTRY: usize = 4;
+const PER_ENTRY: usize = 8;
 
 /// An image of the archive.
 struct Picture {

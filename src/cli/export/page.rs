@@ -1,0 +1,60 @@
+//! `--format html`: the interactive view of a scene as one file.
+use super::{ExportArgs, Exported};
+use crate::cli::outputs::WrittenFile;
+use crate::cli::scene;
+use crate::format::scene_dir::Scene;
+use crate::report::thousands;
+use crate::report::viewer::{CodeNames, Scene3d};
+use crate::{Error, Result};
+use serde_json::json;
+
+/// Refuses options that a page has no use for.
+pub(super) fn check(args: &ExportArgs) -> Result<()> {
+    if args.up.is_some() || args.metres || args.raw {
+        return Err(Error::input(
+            "--format html: a page opens upright and keeps the scene's coordinates; leave --up, --metres and --raw out",
+        ));
+    }
+    Ok(())
+}
+
+/// Writes the page. It shows all splats of the scene that fit, and hides at a key those that no
+/// photo shows.
+pub(super) fn write(args: &ExportArgs, scene: &Scene, file: WrittenFile) -> Result<Exported> {
+    if scene.splats.is_empty() {
+        return Err(Error::input(format!("{}: no splats to show", args.scene.display())));
+    }
+    let images = scene::photos(scene);
+    let title = args.title.clone().unwrap_or_else(|| scene::title(&args.scene));
+    let view = Scene3d {
+        title: &title,
+        splats: &scene.splats,
+        seen: &scene.seen,
+        backdrop: &scene.backdrop,
+        cameras: &scene.cameras,
+        world: &scene.world,
+        photos: images.iter().collect(),
+        language: scene.language.as_ref(),
+        names: &CodeNames::new(),
+        answers: Vec::new(),
+        suggested: Vec::new(),
+    };
+    let page = view.presented()?;
+    file.keep(|path| std::fs::write(path, &page.html).map_err(Error::unwritable(path)))?;
+    let up = scene.world.up.as_ref();
+    let upright = match up {
+        Some(up) => format!("opens upright (±{:.1}°)", up.sigma_degrees),
+        None => "opens as the photos were held (which way is up is not known)".to_owned(),
+    };
+    let metres = scene.world.scale.as_ref();
+    let lengths = if metres.is_some() { "measures in metres" } else { "measures in the scene's own unit" };
+    let (shown, total) = (thousands(page.shown), thousands(page.total));
+    let megabytes = page.html.len() as f64 / 1e6;
+    let text = format!("{upright}, {lengths}, {shown} of {total} splats, {megabytes:.1} MB");
+    let json = json!({
+        "up": up.map(|up| json!({ "axis": null, "sigma_degrees": up.sigma_degrees })),
+        "metres": metres.map(|s| json!({ "metres_per_unit": s.metres_per_unit, "log_sigma": s.log_sigma })),
+        "splats": page.shown, "left_out": page.total - page.shown, "title": title,
+    });
+    Ok(Exported::new(text, json))
+}
