@@ -19,6 +19,8 @@ from jsonschema import Draft202012Validator
 from jsonschema.exceptions import best_match
 from referencing import Registry, Resource
 
+import node_readers
+
 SCHEMAS = Path(__file__).resolve().parents[2] / "docs/use/schemas"
 SPLATVK, SCENE = Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve()
 WORK = Path(tempfile.mkdtemp(prefix="splatvk-formats-"))
@@ -501,6 +503,7 @@ def json_formats():
 
 
 splats()
+node_readers.check(sys.modules[__name__])
 cameras()
 images()
 language()
