@@ -316,14 +316,25 @@ impl Scene {
     }
     /// Writes a file of Gaussians in the format of its ending (.ply, .spz, .sog, .glb, ...), or a
     /// scene directory where there is no ending. Files keep the axes and the unit of the scene, as
-    /// with `splatvk export --raw`. Existing ones are replaced only with `force`.
+    /// with `splatvk export --raw`; those of USD (.usd, .usda, .usdc) are of `to_usd`. Existing ones
+    /// are replaced only with `force`.
     #[pyo3(signature = (path, force = false))]
-    fn save(&self, py: Python<'_>, path: PathBuf, force: bool) -> PyResult<()> {
-        self.on_device(py, |live| live.save(&path, force))?;
+    fn save(this: &Bound<'_, Self>, path: PathBuf, force: bool) -> PyResult<()> {
+        if is_usd(&path) {
+            return Scene::to_usd(this, path, "y", force);
+        }
+        let scene = this.get();
+        scene.on_device(this.py(), |live| live.save(&path, force))?;
         if path.is_dir() {
-            *self.path.lock().unwrap_or_else(PoisonError::into_inner) = Some(path);
+            *scene.path.lock().unwrap_or_else(PoisonError::into_inner) = Some(path);
         }
         Ok(())
+    }
+    /// Writes a USD file with a ParticleField3DGaussianSplat, upright where the direction up is known
+    /// (`up` is "y" or "z"), and metersPerUnit where metres are. Needs `pip install splatvk[usd]`.
+    #[pyo3(signature = (path, up = "y", force = false))]
+    fn to_usd(this: &Bound<'_, Self>, path: PathBuf, up: &str, force: bool) -> PyResult<()> {
+        this.py().import("splatvk._usd")?.call_method1("write", (this, path, up, force)).map(drop)
     }
     /// The arguments of gsplat's `rasterization`: a dict of means, quats, scales, opacities, colors
     /// (spherical harmonics), sh_degree, rasterize_mode, and viewmats, Ks, width, height of the
@@ -376,6 +387,12 @@ impl Scene {
             )),
         }
     }
+}
+
+/// Whether a file is of USD by its ending.
+fn is_usd(path: &Path) -> bool {
+    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default();
+    ["usd", "usda", "usdc"].iter().any(|usd| ending.eq_ignore_ascii_case(usd))
 }
 
 /// The scene in the types of another package, by a function of `splatvk._convert`.
