@@ -180,6 +180,7 @@ fn export_refuses_mismatched_file_name() {
         &["export", &path_of("a.ply"), "--out", &path_of("c.obj")],
         &["no format", "--format", ".spz", ".json"],
     );
+    refuses(2, &["export", &path_of("a.ply"), &path_of("c.usdc")], &["Python", "splatvk[usd]"]);
 }
 
 #[test]

@@ -62,9 +62,11 @@ fn forced(mut line: Vec<OsString>) -> Vec<OsString> {
 }
 
 /// Commands that write a file; then those that write a folder.
-const FILES: [&str; 4] = [
+const FILES: [&str; 6] = [
     "export SCENE --format ply --out",
     "export SCENE --format spz --out",
+    "export SCENE --format sog --out",
+    "export SCENE --format html --out",
     "export SCENE --format transforms --out",
     "bench sort --keys 1000 --repeats 1 --json",
 ];

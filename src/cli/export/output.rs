@@ -69,6 +69,12 @@ pub fn format(args: &ExportArgs) -> Result<&str> {
     let lower = out.to_string_lossy().to_lowercase();
     match endings().find(|(_, ending)| lower.ends_with(ending)) {
         Some((name, _)) => Ok(name),
+        None if [".usd", ".usda", ".usdc", ".usdz"].iter().any(|usd| lower.ends_with(usd)) => {
+            Err(Error::input(format!(
+                "{}: USD is written by the Python package splatvk[usd]: scene.save(\"kitchen.usdc\")",
+                out.display()
+            )))
+        }
         None => Err(Error::input(format!(
             "{}: its ending states no format; give --format, or one of the endings {}",
             out.display(),

@@ -44,6 +44,7 @@ pub(super) fn write(args: &ExportArgs, scene: &Scene, file: WrittenFile) -> Resu
     let up = scene.world.up.as_ref();
     let upright = match up {
         Some(up) => format!("opens upright (±{:.1}°)", up.sigma_degrees),
+        None if scene.cameras.is_empty() => "opens along the axes of the file, which states no up".to_owned(),
         None => "opens as the photos were held (which way is up is not known)".to_owned(),
     };
     let metres = scene.world.scale.as_ref();
