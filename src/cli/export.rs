@@ -67,8 +67,8 @@ pub struct ExportArgs {
     /// up); spz, glb and gltf have y [default: y for these, else -y, where the scene states up]
     #[arg(long, value_parser = up_axis, allow_hyphen_values = true, value_name = "AXIS")]
     pub up: Option<UpAxis>,
-    /// Refuse a scene whose metres are not known (splatvk measure --scale) [default: metres where
-    /// they are known]
+    /// Scale to metres, and refuse a scene whose metres are not known (splatvk measure --scale)
+    /// [default: metres where they are known]
     #[arg(long)]
     pub metres: bool,
     /// Keep the axes and the unit of the scene, as its own cameras have them, except for those that

@@ -1,10 +1,10 @@
 //! `.sog` of PlayCanvas ("Spatially Ordered Gaussians"), version 2: lossless images with a byte or
 //! two per number, and `meta.json`, in a zip archive; on reading also as files of a folder. About
-//! a fifteenth of the size of a PLY with SH.
+//! a twelfth of the size of a PLY with SH.
 //!
 //! Positions have 16 bits on a logarithmic scale, scales and base colours share codebooks of 256
 //! numbers, the SH of a Gaussian are one row of a palette. The published text calls y up, but
-//! SuperSplat, splat-transform and Spark read and write the axes of PLY files, and so does this.
+//! SuperSplat, splat-transform and Spark take its axes for those of PLY files, and so does this.
 mod codebook;
 mod palette;
 mod read;
