@@ -2,7 +2,7 @@
 mod losses;
 mod output;
 mod page;
-mod placement;
+pub mod placement;
 
 pub use output::{format, is_folder};
 
@@ -19,7 +19,7 @@ use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser};
 use losses::{warn_of_losses, warn_of_models};
 use output::{Output, check_ending};
-use placement::{Placement, up_axis};
+use placement::{Asked, Placement, up_axis};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -186,7 +186,8 @@ pub fn write(args: &ExportArgs) -> Result<Exported> {
         other => other,
     };
     let content = select(&mut scene, args.guessed);
-    let placement = Placement::new(&scene, args, format)?;
+    let asked = Asked { up: args.up, metres: args.metres, raw: args.raw };
+    let placement = Placement::new(&scene, asked, format)?;
     let mut points = match is_folder(format) {
         true => colmap::read_points(&args.scene.join("cameras/colmap")).ok(),
         false => None,

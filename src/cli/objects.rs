@@ -1,5 +1,6 @@
 //! `splatvk objects`
 use super::args::{DeviceArgs, share};
+use super::export::placement::{Asked, Placement};
 use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::progress;
@@ -65,6 +66,10 @@ pub struct ObjectsArgs {
     /// Format of the file of each thing
     #[arg(long, default_value = "ply", value_parser = PossibleValuesParser::new(FORMATS.iter().map(|f| f.name)), value_name = "FORMAT")]
     pub format: String,
+    /// Keep the axes and the unit of the scene in the files [default: upright and in metres, as far as
+    /// the scene states them]
+    #[arg(long, requires = "out")]
+    pub raw: bool,
     /// Write over what is there: ordinary files of the same names
     #[arg(long, requires = "out")]
     pub force: bool,
@@ -103,13 +108,19 @@ pub fn objects(args: &ObjectsArgs) -> Result<()> {
     let list = objects::list(&mut ready, &scene.cameras, &options, progress.as_ref())?;
     let stems = views::stems(&scene.cameras)?;
     let mut entries: Vec<Value> = list.iter().map(|o| o.record(&list, &stems, &scene.world)).collect();
+    let mut report = json!({
+        "scene": args.scene, "out": args.out, "world": scene.world,
+        "level": LEVEL_NAMES[args.level.index()], "files": null,
+    });
     if let Some(out) = &mut out {
+        let asked = Asked { raw: args.raw, ..Asked::default() };
+        let placement = Placement::new(&scene, asked, &args.format)?;
+        placement.apply(&mut scene, &mut None);
+        progress.inform(&format!("files are {}", placement.text()));
+        report["files"] = placement.json();
         write_files(args, out, &scene, &ready, &list, &mut entries)?;
     }
-    let report = json!({
-        "scene": args.scene, "out": args.out, "world": scene.world,
-        "level": LEVEL_NAMES[args.level.index()], "objects": entries,
-    });
+    report["objects"] = entries.into();
     if let Some(mut out) = out {
         write_json(&out.file("objects.json")?, &report)?;
         out.keep()?;

@@ -1,5 +1,4 @@
-//! Placement of an export in the world: `--up`, `--metres`, `--raw`, and their statement.
-use super::ExportArgs;
+//! Placement of written splats in the world: `--up`, `--metres`, `--raw`, and their statement.
 use crate::format::gaussians::SplatFormat;
 use crate::format::scene_dir::Scene;
 use crate::format::transform::transform_splats;
@@ -29,8 +28,19 @@ enum Kept {
     File,
 }
 
+/// Placement that the user asks for.
+#[derive(Clone, Copy, Default)]
+pub struct Asked {
+    /// `--up`
+    pub up: Option<UpAxis>,
+    /// `--metres`
+    pub metres: bool,
+    /// `--raw`
+    pub raw: bool,
+}
+
 /// Where an export places the scene.
-pub(super) struct Placement {
+pub struct Placement {
     up: Result<(UpAxis, Up), Kept>,
     metres: Result<Scale, Kept>,
     /// Whether the writer of the format converts right, down, forward to right, up, back.
@@ -42,26 +52,26 @@ impl Placement {
     ///
     /// # Errors
     /// `--up` or `--metres` where the scene does not state it, or an axis that the format excludes.
-    pub(super) fn new(scene: &Scene, args: &ExportArgs, format: &str) -> Result<Placement> {
+    pub fn new(scene: &Scene, asked: Asked, format: &str) -> Result<Placement> {
         let y_up = SplatFormat::named(format).is_some_and(|format| format.y_up);
-        if y_up && args.up.is_some_and(|axis| axis != UpAxis::PlusY) {
+        if y_up && asked.up.is_some_and(|axis| axis != UpAxis::PlusY) {
             return Err(Error::input(format!("--up: {format} has y up by definition; give --up y")));
         }
-        let unknown = |why: &str| Error::input(format!("{}: {why}", args.scene.display()));
+        let unknown = |why: &str| Error::input(format!("{}: {why}", scene.path.display()));
         let missing = if scene.cameras.is_empty() { Kept::File } else { Kept::Unknown };
-        let axis = args.up.unwrap_or(if y_up { UpAxis::PlusY } else { UpAxis::MinusY });
+        let axis = asked.up.unwrap_or(if y_up { UpAxis::PlusY } else { UpAxis::MinusY });
         let up = match &scene.world.up {
-            _ if args.raw && args.up.is_none() => Err(Kept::Asked),
+            _ if asked.raw && asked.up.is_none() => Err(Kept::Asked),
             Some(up) => Ok((axis, up.clone())),
-            None if args.up.is_some() => {
+            None if asked.up.is_some() => {
                 return Err(unknown("which way is up is not known; leave --up out"));
             }
             None => Err(missing),
         };
         let metres = match &scene.world.scale {
-            _ if args.raw && !args.metres => Err(Kept::Asked),
+            _ if asked.raw && !asked.metres => Err(Kept::Asked),
             Some(scale) => Ok(scale.clone()),
-            None if args.metres => {
+            None if asked.metres => {
                 return Err(unknown(
                     "its scale is not known; state a length with splatvk measure --scale, or leave --metres out",
                 ));
@@ -85,7 +95,7 @@ impl Placement {
     }
 
     /// Moves splats, cameras and points of a scene together.
-    pub(super) fn apply(&self, scene: &mut Scene, points: &mut Option<PointCloud>) {
+    pub fn apply(&self, scene: &mut Scene, points: &mut Option<PointCloud>) {
         let Some(by) = self.transform() else { return };
         let levels = scene.language.iter_mut().flat_map(|field| &mut field.levels);
         let own = levels.filter_map(|level| level.splats.as_mut());
@@ -100,7 +110,7 @@ impl Placement {
     }
 
     /// Statement of the axes and of the unit.
-    pub(super) fn text(&self) -> String {
+    pub fn text(&self) -> String {
         let turned = if self.y_up { " (as right, up, back)" } else { "" };
         let upright = self.up.as_ref().map(|(axis, up)| {
             let axis = match axis {
@@ -134,7 +144,7 @@ impl Placement {
     }
 
     /// Statement of the axes and of the unit, for `--json`.
-    pub(super) fn json(&self) -> Value {
+    pub fn json(&self) -> Value {
         let up = self.up.as_ref().ok().map(|(axis, up)| {
             let axis = match axis {
                 UpAxis::MinusY => "-y",
