@@ -43,7 +43,7 @@ pub struct SavingArgs {
     pub force: bool,
     /// Folder of a mask per photo, x.png or x.jpg.png for x.jpg: black is not used [default: masks
     /// beside images]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, visible_alias = "mask-photos", value_name = "DIR")]
     pub photo_masks: Option<PathBuf>,
     /// How often training keeps its state for --resume, seconds
     #[arg(long, default_value_t = CHECKPOINT_SECONDS, value_name = "N", value_parser = whole::<u64>(0..), help_heading = EXPERTS)]
