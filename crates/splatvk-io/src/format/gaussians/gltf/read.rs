@@ -2,8 +2,9 @@
 //! above it.
 use super::buffers::{Buffer, contents};
 use super::extensions::{self, Refused};
-use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
+use super::layout::{EXTENSION, attribute, turned};
 use crate::format::gaussians::degree;
+use crate::format::glb::{BIN_CHUNK, FLOAT, JSON_CHUNK, MAGIC};
 use crate::format::{logit, transform};
 use crate::scene::{Similarity, Splats, sh_coefficients};
 use crate::{Error, Result, files};

@@ -1,6 +1,7 @@
 //! Writer.
-use super::layout::{BIN_CHUNK, EXTENSION, FLOAT, JSON_CHUNK, MAGIC, attribute, turned};
+use super::layout::{EXTENSION, attribute, turned};
 use crate::format::gaussians::usable;
+use crate::format::glb::{self, Numbers};
 use crate::format::transform;
 use crate::math::quaternion_norm;
 use crate::math::sigmoid;
@@ -14,29 +15,8 @@ use std::path::Path;
 /// Writes a binary file, in the order of the scene.
 pub fn write_glb(path: &Path, splats: &Splats) -> Result<()> {
     usable::check_written(splats)?;
-    let (mut root, data) = document(splats);
-    root["buffers"] = json!([{ "byteLength": data.len() }]);
-    let mut text = root.to_string().into_bytes();
-    text.resize(text.len().next_multiple_of(4), b' ');
-    let total = 12 + 8 + text.len() + 8 + data.len();
-    let mut out = Vec::with_capacity(total);
-    for bytes in [MAGIC.to_le_bytes(), 2u32.to_le_bytes(), size_bytes(total, path)?] {
-        out.extend(bytes);
-    }
-    for (chunk, kind) in [(text, JSON_CHUNK), (data, BIN_CHUNK)] {
-        out.extend(size_bytes(chunk.len(), path)?);
-        out.extend(kind.to_le_bytes());
-        out.extend(chunk);
-    }
-    std::fs::write(path, out).map_err(Error::unwritable(path))
-}
-
-/// Bytes of a size in a `.glb`.
-fn size_bytes(n: usize, path: &Path) -> Result<[u8; 4]> {
-    u32::try_from(n).map(u32::to_le_bytes).map_err(|_| {
-        let path = path.display();
-        Error::work(format!("{path}: more than the 4 GiB of a .glb file; write a .ply instead"))
-    })
+    let (root, data) = document(splats);
+    glb::write(path, root, data)
 }
 
 /// Writes one text file with the buffer as a data URI, in the order of the scene.
@@ -52,16 +32,9 @@ pub fn write_gltf(path: &Path, splats: &Splats) -> Result<()> {
 fn document(splats: &Splats) -> (Value, Vec<u8>) {
     let mut s = splats.clone();
     transform::transform_splats(&mut s, &turned());
-    let mut parts = Parts { count: s.len(), ..Parts::default() };
-    parts.floats("POSITION".into(), "VEC3", s.means.as_flattened());
-    if let Some(position) = parts.accessors.last_mut() {
-        let bound = |pick: fn(f32, f32) -> f32, from: f32| {
-            s.means.iter().fold([from; 3], |b, m| [0, 1, 2].map(|k| pick(b[k], m[k])))
-        };
-        // glTF requires the extent of positions.
-        position["min"] = json!(bound(f32::min, f32::INFINITY));
-        position["max"] = json!(bound(f32::max, f32::NEG_INFINITY));
-    }
+    let mut numbers = Numbers::default();
+    let mut attributes = serde_json::Map::new();
+    attributes.insert("POSITION".into(), json!(numbers.positions(&s.means)));
     let rotations: Vec<f32> = s
         .quats
         .iter()
@@ -70,11 +43,11 @@ fn document(splats: &Splats) -> (Value, Vec<u8>) {
             [1, 2, 3, 0].map(|k| q[k] / norm)
         })
         .collect();
-    parts.floats(attribute("ROTATION"), "VEC4", &rotations);
+    attributes.insert(attribute("ROTATION"), json!(numbers.floats("VEC4", 4, &rotations)));
     let scales: Vec<f32> = s.log_scales.as_flattened().iter().map(|v| v.exp()).collect();
-    parts.floats(attribute("SCALE"), "VEC3", &scales);
+    attributes.insert(attribute("SCALE"), json!(numbers.floats("VEC3", 3, &scales)));
     let opacities: Vec<f32> = s.opacity_logits.iter().map(|v| sigmoid(*v)).collect();
-    parts.floats(attribute("OPACITY"), "SCALAR", &opacities);
+    attributes.insert(attribute("OPACITY"), json!(numbers.floats("SCALAR", 1, &opacities)));
     let width = 3 * s.sh_len();
     let coefficient = |k: usize| -> Vec<f32> {
         s.sh.chunks_exact(width).flat_map(|row| row[3 * k..3 * k + 3].iter().copied()).collect()
@@ -82,17 +55,15 @@ fn document(splats: &Splats) -> (Value, Vec<u8>) {
     for degree in 0..=s.sh_degree as usize {
         for n in 0..=2 * degree {
             let name = attribute(&format!("SH_DEGREE_{degree}_COEF_{n}"));
-            parts.floats(name, "VEC3", &coefficient(degree * degree + n));
+            attributes.insert(name, json!(numbers.floats("VEC3", 3, &coefficient(degree * degree + n))));
         }
     }
-    let fallback: Vec<u8> = coefficient(0)
+    let fallback: Vec<f32> = coefficient(0)
         .chunks_exact(3)
         .zip(&opacities)
         .flat_map(|(dc, a)| [linear(dc[0]), linear(dc[1]), linear(dc[2]), *a])
-        .flat_map(|v| ((v * 65535.0).round() as u16).to_le_bytes())
         .collect();
-    const UNSIGNED_SHORT: u32 = 5123;
-    parts.add("COLOR_0".into(), "VEC4", UNSIGNED_SHORT, &fallback);
+    attributes.insert("COLOR_0".into(), json!(numbers.shares("VEC4", 4, &fallback)));
     let root = json!({
         "asset": { "version": "2.0", "generator": concat!("splatvk ", env!("CARGO_PKG_VERSION")) },
         "extensionsUsed": [EXTENSION],
@@ -101,7 +72,7 @@ fn document(splats: &Splats) -> (Value, Vec<u8>) {
         "nodes": [{ "mesh": 0 }],
         "meshes": [{ "primitives": [{
             "mode": 0,
-            "attributes": parts.attributes,
+            "attributes": attributes,
             "extensions": { EXTENSION: {
                 "kernel": "ellipse",
                 "colorSpace": "srgb_rec709_display",
@@ -109,47 +80,14 @@ fn document(splats: &Splats) -> (Value, Vec<u8>) {
                 "sortingMethod": "cameraDistance"
             } }
         }] }],
-        "accessors": parts.accessors,
-        "bufferViews": parts.views,
+        "accessors": numbers.accessors,
+        "bufferViews": numbers.views,
     });
-    (root, parts.data)
+    (root, numbers.data)
 }
 
 /// Base colour of a splat in linear light, as glTF's vertex colours are.
 fn linear(dc: f32) -> f32 {
     let v = (0.5 + SH_C0 * dc).clamp(0.0, 1.0);
     to_linear(v)
-}
-
-/// Attributes, one after the other in one buffer.
-#[derive(Default)]
-struct Parts {
-    count: usize,
-    data: Vec<u8>,
-    attributes: serde_json::Map<String, Value>,
-    accessors: Vec<Value>,
-    views: Vec<Value>,
-}
-
-impl Parts {
-    fn floats(&mut self, name: String, kind: &str, values: &[f32]) {
-        self.add(name, kind, FLOAT, &values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>());
-    }
-
-    fn add(&mut self, name: String, kind: &str, component: u32, bytes: &[u8]) {
-        const ARRAY_BUFFER: u32 = 34962;
-        let view = json!({
-            "buffer": 0, "byteOffset": self.data.len(), "byteLength": bytes.len(), "target": ARRAY_BUFFER
-        });
-        let mut accessor = json!({
-            "bufferView": self.views.len(), "componentType": component, "count": self.count, "type": kind
-        });
-        if component != FLOAT {
-            accessor["normalized"] = json!(true);
-        }
-        self.attributes.insert(name, json!(self.accessors.len()));
-        self.accessors.push(accessor);
-        self.views.push(view);
-        self.data.extend_from_slice(bytes);
-    }
 }
