@@ -62,12 +62,13 @@ fn forced(mut line: Vec<OsString>) -> Vec<OsString> {
 }
 
 /// Commands that write a file; then those that write a folder.
-const FILES: [&str; 6] = [
+const FILES: [&str; 7] = [
     "export SCENE --format ply --out",
     "export SCENE --format spz --out",
     "export SCENE --format sog --out",
     "export SCENE --format html --out",
     "export SCENE --format transforms --out",
+    "mesh SCENE --format ply",
     "bench sort --keys 1000 --repeats 1 --json",
 ];
 const FOLDERS: [&str; 6] = [

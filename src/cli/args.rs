@@ -12,6 +12,7 @@ pub use super::demo::DemoArgs;
 pub use super::export::ExportArgs;
 pub use super::label::LabelArgs;
 pub use super::measure::MeasureArgs;
+pub use super::mesh::MeshArgs;
 pub use super::objects::ObjectsArgs;
 pub use super::run::RunArgs;
 pub use crate::run::config::whole;
@@ -54,6 +55,8 @@ pub enum Command {
     Eval(EvalArgs),
     /// Scene → another program's format
     Export(ExportArgs),
+    /// Surfaces of a scene → triangles: .glb, .ply, .obj
+    Mesh(MeshArgs),
     /// The installed models
     Models(ModelsArgs),
     /// How fast this machine trains and renders
@@ -115,6 +118,7 @@ impl Command {
             | Command::Ablate(_)
             | Command::Generate(_)
             | Command::Export(_)
+            | Command::Mesh(_)
             | Command::Measure(_)
             | Command::Clean(_)
             | Command::Completions(_)

@@ -13,6 +13,7 @@ mod kept;
 mod label;
 mod line;
 mod measure;
+mod mesh;
 mod models;
 mod objects;
 pub mod outputs;
@@ -103,6 +104,7 @@ impl Program for Cli {
         ("render", &["provider"]),
         ("measure", &["provider", "log"]),
         ("export", &["provider", "log"]),
+        ("mesh", &["provider"]),
         ("batch", &["provider"]),
         ("clean", &["provider", "log"]),
         ("completions", &["provider", "log"]),
@@ -130,6 +132,7 @@ impl Program for Cli {
             Command::Eval(args) => eval::eval(&args),
             Command::Measure(args) => measure::measure(&args),
             Command::Export(args) => export::export(&args),
+            Command::Mesh(args) => mesh::mesh(&args),
             Command::Models(args) => models::models(&args),
             Command::Bench(args) => bench::bench(&args),
             #[cfg(unix)]

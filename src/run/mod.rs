@@ -14,6 +14,7 @@ mod graph;
 mod label;
 mod light;
 pub mod live;
+pub mod mesh;
 pub mod method;
 pub mod metric;
 mod networks;

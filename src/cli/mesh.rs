@@ -1,0 +1,278 @@
+//! `splatvk mesh`: surfaces of a scene as triangles.
+use super::args::DeviceArgs;
+use super::outputs::WrittenFile;
+use super::print::{print, print_json};
+use super::progress;
+use super::{scene, views};
+use crate::format::mesh::{self as files, MeshFile, MeshFormat};
+use crate::format::scene_dir::Scene;
+use crate::run::mesh::{self, MeshOptions, Placement, SceneMesh, Things};
+use crate::scene::{Mesh, World};
+use crate::{Error, Result};
+use clap::{Args, ValueEnum};
+use serde_json::{Value, json};
+use splatvk_mesh::{Collider, Simplify};
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+/// `splatvk mesh`
+#[derive(Debug, Args)]
+pub struct MeshArgs {
+    /// Scene directory, or with --cameras a file of Gaussians
+    pub scene: PathBuf,
+    /// File to write
+    pub file: PathBuf,
+    /// Format of the file [default: by its ending: .glb, .ply or .obj]
+    #[arg(long, value_enum, value_name = "FORMAT")]
+    pub format: Option<FormatKind>,
+    /// Most triangles
+    #[arg(long, default_value_t = 100_000, value_parser = super::args::whole::<usize>(1..=100_000_000), value_name = "N")]
+    pub triangles: usize,
+    /// Simplify as far as 99.9 % of the surface moves by at most this length, instead of to a number
+    /// of triangles: 2mm, 0.5cm, or a number in the units of the scene
+    #[arg(long, conflicts_with = "triangles", value_name = "LENGTH")]
+    pub error: Option<Length>,
+    /// Side of a voxel [default: two pixels of the photos at their surfaces]
+    #[arg(long, value_name = "LENGTH")]
+    pub voxel: Option<Length>,
+    /// Also surfaces that no photo shows; without it they are holes
+    #[arg(long)]
+    pub fill_guessed: bool,
+    /// Shapes for physics beside every part: its convex hull, or convex pieces
+    #[arg(long, value_enum, default_value_t = ColliderKind::None, value_name = "KIND")]
+    pub collider: ColliderKind,
+    /// A part with a name for every thing of the scene
+    #[arg(long)]
+    pub by_object: bool,
+    /// Cameras to look from: transforms.json, a COLMAP model or cameras.json [default: those of the
+    /// photos]
+    #[arg(long, value_name = "FILE")]
+    pub cameras: Option<PathBuf>,
+    /// Keep the scene's own axes, units and origin, as export does
+    #[arg(long)]
+    pub raw: bool,
+    /// Write over an ordinary file
+    #[arg(long)]
+    pub force: bool,
+    /// Device and output
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// Formats of meshes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum FormatKind {
+    /// Binary glTF, with named nodes and linear colours
+    Glb,
+    /// Binary PLY with colours
+    Ply,
+    /// Wavefront OBJ with colours and named groups
+    Obj,
+}
+
+impl From<FormatKind> for MeshFormat {
+    fn from(kind: FormatKind) -> MeshFormat {
+        match kind {
+            FormatKind::Glb => MeshFormat::Glb,
+            FormatKind::Ply => MeshFormat::Ply,
+            FormatKind::Obj => MeshFormat::Obj,
+        }
+    }
+}
+
+/// Shapes for physics.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum ColliderKind {
+    /// None
+    None,
+    /// The convex hull
+    Hull,
+    /// Convex pieces that follow the shape (V-HACD)
+    Decomposition,
+}
+
+impl ColliderKind {
+    fn kind(self) -> Option<Collider> {
+        match self {
+            ColliderKind::None => None,
+            ColliderKind::Hull => Some(Collider::Hull),
+            ColliderKind::Decomposition => Some(Collider::Decomposition),
+        }
+    }
+}
+
+/// A positive length: metres with m, cm or mm, otherwise units of the scene.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Length {
+    /// Metres.
+    Metres(f64),
+    /// Scene units.
+    Units(f64),
+}
+
+impl FromStr for Length {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Length, String> {
+        let text = text.trim();
+        let metres = [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)];
+        let found = metres.iter().find_map(|(name, unit)| Some((text.strip_suffix(name)?, *unit)));
+        let number = found.map_or(text, |(number, _)| number).trim().parse::<f64>().ok();
+        let number = number.filter(|v| v.is_finite() && *v > 0.0).ok_or_else(|| {
+            format!(
+                "\"{text}\": give a positive length such as 2mm, 0.5cm, or 0.01 in the units of the scene"
+            )
+        })?;
+        Ok(found.map_or(Length::Units(number), |(_, unit)| Length::Metres(number * unit)))
+    }
+}
+
+impl Length {
+    /// Scene units.
+    fn in_units(self, scene: &Scene) -> Result<f64> {
+        match (self, &scene.world.scale) {
+            (Length::Units(units), _) => Ok(units),
+            (Length::Metres(metres), Some(scale)) => Ok(metres / scale.metres_per_unit),
+            (Length::Metres(metres), None) => Err(Error::input(format!(
+                "{}: its scale is not known, so {metres} m cannot be used; state a length with splatvk measure --scale, \
+                 or give a number in the units of the scene",
+                scene.path.display()
+            ))),
+        }
+    }
+}
+
+pub fn mesh(args: &MeshArgs) -> Result<()> {
+    let format = args.format.map_or_else(|| MeshFormat::of(&args.file), |kind| Ok(kind.into()))?;
+    if args.collider != ColliderKind::None && !format.has_colliders() {
+        return Err(Error::input("--collider: a .ply holds one mesh; write a .glb or .obj"));
+    }
+    let inputs: Vec<&Path> =
+        std::iter::once(&args.scene).chain(&args.cameras).map(PathBuf::as_path).collect();
+    let out = WrittenFile::open(&args.file, args.force, &inputs)?;
+    let scene = scene::load(&args.scene)?;
+    let things = if args.by_object { Some(things(&scene)?) } else { None };
+    let given = args.cameras.as_deref().map(views::read).transpose()?;
+    let cameras = given.as_deref().unwrap_or(&scene.cameras);
+    let name = scene_name(&args.scene);
+    let options = options(args, &scene)?;
+    let progress = progress::reporter();
+    let device = args.device.device.as_deref();
+    let made = mesh::mesh(&scene, cameras, things.as_ref(), &name, options, device, progress.as_ref())?;
+    let placement = match args.raw {
+        true => Placement::own(format.is_y_up()),
+        false => Placement::standing(&made.mesh, &scene.world),
+    };
+    let mut placed = mesh::placed(&made.mesh, &placement.by);
+    if let Some(collider) = args.collider.kind() {
+        mesh::add_colliders(&mut placed, collider);
+    }
+    progress.check()?;
+    let figures = figures(&made, &placed, &placement, &scene.world, args);
+    let file = MeshFile { name: &name, own_origins: things.is_some(), extras: figures.clone() };
+    out.keep(|path| files::write(path, &placed, format, &file))?;
+    match args.device.json {
+        true => print_json(&with_file(figures, &args.file)),
+        false => print(&line(&figures, &args.file)),
+    }
+}
+
+/// The things of a scene for `--by-object`. This is the one place that joins `splatvk mesh` with the
+/// list of things.
+fn things(scene: &Scene) -> Result<Things> {
+    Err(Error::input(format!(
+        "{}: --by-object needs a list of things, which this version does not make; leave --by-object out",
+        scene.path.display()
+    )))
+}
+
+fn options(args: &MeshArgs, scene: &Scene) -> Result<MeshOptions> {
+    let units = |length: Option<Length>| length.map(|l| l.in_units(scene)).transpose();
+    Ok(MeshOptions {
+        voxel: units(args.voxel)?,
+        simplify: units(args.error)?.map_or(Simplify::Triangles(args.triangles), Simplify::Error),
+        fill_guessed: args.fill_guessed,
+    })
+}
+
+/// Name of a scene: that of its folder or file.
+fn scene_name(path: &Path) -> String {
+    let whole = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    let name = whole.file_stem().map(|n| n.to_string_lossy().into_owned());
+    name.unwrap_or_else(|| "scene".to_owned())
+}
+
+/// Figures of a mesh, lengths in the units of the file.
+fn figures(made: &SceneMesh, placed: &Mesh, placement: &Placement, world: &World, args: &MeshArgs) -> Value {
+    let scale = placement.by.scale;
+    let up = world.up.as_ref().filter(|_| placement.upright);
+    let (low, high) = placed.extent().unwrap_or_default();
+    let size = [0, 1, 2].map(|k| high[k] - low[k]);
+    json!({
+        "unit": if placement.metric { "metre" } else { "scene unit" },
+        "up": if args.raw { "as in the scene" } else if placement.upright { "y" } else { "unknown" },
+        "up_sigma_degrees": up.map(|up| up.sigma_degrees),
+        "triangles": placed.triangles.len(),
+        "vertices": placed.positions.len(),
+        "parts": placed.parts.len(),
+        "size": size,
+        "area": made.area * scale * scale,
+        "border_edges": made.border_edges,
+        "voxel": made.voxel * scale,
+        "moved": made.moved * scale,
+        "views": made.views,
+        "guessed": args.fill_guessed,
+    })
+}
+
+fn with_file(mut figures: Value, file: &Path) -> Value {
+    figures["file"] = json!(file);
+    figures
+}
+
+/// One line on what was written.
+fn line(figures: &Value, file: &Path) -> String {
+    let number = |key: &str| figures[key].as_f64().unwrap_or_default();
+    let metric = figures["unit"] == "metre";
+    let length = |key: &str| match metric {
+        true => format!("{:.1} mm", 1000.0 * number(key)),
+        false => format!("{:.2e} units", number(key)),
+    };
+    let up = match (figures["up"].as_str(), figures["up_sigma_degrees"].as_f64()) {
+        (Some("y"), Some(sigma)) => format!("y is up ± {sigma:.1}°"),
+        (Some("unknown"), _) => "up is not known".to_owned(),
+        _ => "axes of the scene".to_owned(),
+    };
+    let parts = match figures["parts"].as_u64() {
+        Some(1) | None => String::new(),
+        Some(n) => format!(" in {n} parts"),
+    };
+    let (unit, square) = if metric { ("metres", "m²") } else { ("scene units", "square units") };
+    format!(
+        "{}: {} triangles{parts}, {unit}, {up}; {:.3} {square}, {} edges at holes and borders; voxels of {}, simplification \
+         moved 99.9 % of the surface by {} at most\n",
+        file.display(),
+        figures["triangles"],
+        number("area"),
+        figures["border_edges"],
+        length("voxel"),
+        length("moved")
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lengths_have_units_or_are_the_scenes() {
+        assert_eq!("2mm".parse(), Ok(Length::Metres(0.002)));
+        assert_eq!(" 0.5 cm".parse(), Ok(Length::Metres(0.005)));
+        assert_eq!("0.01".parse(), Ok(Length::Units(0.01)));
+        for text in ["", "mm", "-1", "0", "inf", "2 inches"] {
+            assert!(text.parse::<Length>().is_err(), "{text}");
+        }
+        let error = Length::Metres(0.002).in_units(&Scene::default()).unwrap_err();
+        assert!(error.exit_code() == 2 && error.to_string().contains("splatvk measure --scale"));
+    }
+}
