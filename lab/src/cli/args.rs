@@ -40,6 +40,8 @@ pub enum Command {
     Eval(EvalArgs),
     /// Scene against polygons on its photos → how useful its answers are to a user
     Ask(AskArgs),
+    /// Mesh of a scene against true depth → accuracy, precision, recall, F1
+    MeshAccuracy(MeshAccuracyArgs),
 }
 
 /// Published protocols.
@@ -116,6 +118,28 @@ pub struct AskArgs {
     /// Folder of label files as in LERF-OVS, one per photo, and texts.json
     #[arg(long, value_name = "DIR")]
     pub labels: PathBuf,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatlab mesh-accuracy`
+#[derive(Debug, Args)]
+pub struct MeshAccuracyArgs {
+    /// Scene directory
+    pub scene: PathBuf,
+    /// Folder with ground_truth.json and depth
+    #[arg(long, value_name = "DIR")]
+    pub ground_truth: PathBuf,
+    /// Most triangles
+    #[arg(long, default_value_t = 100_000, value_name = "N")]
+    pub triangles: usize,
+    /// Side of a voxel, scene units [default: two pixels]
+    #[arg(long, value_name = "LENGTH")]
+    pub voxel: Option<f64>,
+    /// Also surfaces that no photo shows
+    #[arg(long)]
+    pub fill_guessed: bool,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

@@ -8,6 +8,7 @@ mod curve;
 mod eval;
 mod figures;
 mod generate;
+mod mesh_accuracy;
 mod study;
 
 use crate::Result;
@@ -25,7 +26,7 @@ impl Program for Lab {
     const NAME: &'static str = "splatlab";
 
     const UNUSED: &'static [(&'static str, &'static [&'static str])] =
-        &[("generate", &["provider", "log"]), ("alignment", &["provider"])];
+        &[("generate", &["provider", "log"]), ("alignment", &["provider"]), ("mesh-accuracy", &["provider"])];
 
     fn log(&self) -> LogFormat {
         self.global.log
@@ -51,6 +52,7 @@ impl Program for Lab {
                 args.device.provider = self.global.provider;
                 eval::eval(&args)
             }
+            Command::MeshAccuracy(args) => mesh_accuracy::mesh_accuracy(&args),
             Command::Ask(mut args) => {
                 args.device.provider = self.global.provider;
                 ask::ask(&args)
