@@ -14,9 +14,14 @@ use std::sync::OnceLock;
 
 /// The splats of the small scene as a file of another program, in the coordinates of its cameras.
 fn foreign() -> PathBuf {
-    let file = Path::new(env!("CARGO_TARGET_TMPDIR")).join("cli/foreign.ply");
-    std::fs::copy(scene().join("point_cloud.ply"), &file).unwrap();
-    file
+    static FOREIGN: OnceLock<PathBuf> = OnceLock::new();
+    // Once: the tests run in threads.
+    let copied = FOREIGN.get_or_init(|| {
+        let file = Path::new(env!("CARGO_TARGET_TMPDIR")).join("cli/foreign.ply");
+        std::fs::copy(scene().join("point_cloud.ply"), &file).unwrap();
+        file
+    });
+    copied.clone()
 }
 
 /// Runs a command that must succeed, and returns its standard output.
@@ -97,6 +102,28 @@ fn labelled_scene_answers_and_lists_things() {
         .sum();
     let numbers = object_column(&out.join("scene.ply"));
     assert_eq!(numbers.iter().filter(|n| **n > 0).count(), total);
+    let nodes = names(&out.join("scene.glb"));
+    let things = list.iter().filter(|o| o["level"] == "l").map(|o| o["name"].as_str().unwrap());
+    assert!(
+        nodes[0] == "labelled" && things.clone().all(|name| nodes.iter().any(|n| n == name)),
+        "{nodes:?}"
+    );
+
+    // The mesh has the same things as nodes, as far as photos show enough of them.
+    let mesh = folder.path().join("labelled.glb");
+    runs(splatvk().arg("mesh").arg(labelled()).arg(&mesh).arg("--by-object"));
+    let parts = names(&mesh);
+    let named = parts.iter().filter(|part| things.clone().any(|name| *part == name)).count();
+    assert!(parts[0] == "labelled" && named > 0, "{parts:?}");
+}
+
+/// Names of the nodes of a binary glTF, the root first.
+fn names(file: &Path) -> Vec<String> {
+    let bytes = std::fs::read(file).unwrap();
+    let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
+    let root: Value = serde_json::from_slice(&bytes[20..20 + length]).unwrap();
+    let named = |node: &Value| node["name"].as_str().unwrap_or_default().to_owned();
+    root["nodes"].as_array().unwrap().iter().map(named).collect()
 }
 
 /// The last property of every vertex of a binary PLY, which is `int object`.

@@ -3,11 +3,13 @@ use super::args::DeviceArgs;
 use super::outputs::WrittenFile;
 use super::print::{print, print_json};
 use super::progress;
-use super::{scene, views};
+use super::scene::{self, scene_name};
+use super::{objects, views};
 use crate::format::mesh::{self as files, MeshFile, MeshFormat};
 use crate::format::scene_dir::Scene;
 use crate::run::mesh::{self, MeshOptions, Placement, SceneMesh, Things};
-use crate::scene::{Mesh, World};
+use crate::run::objects::ObjectOptions;
+use crate::scene::{LEVEL_NAMES, Mesh, World};
 use crate::{Error, Result};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
@@ -41,9 +43,12 @@ pub struct MeshArgs {
     /// Shapes for physics beside every part: its convex hull, or convex pieces
     #[arg(long, value_enum, default_value_t = ColliderKind::None, value_name = "KIND")]
     pub collider: ColliderKind,
-    /// A part with a name for every thing of the scene
+    /// A part with a name for every thing of the scene, as splatvk objects lists them
     #[arg(long)]
     pub by_object: bool,
+    /// Text file with names to choose from, one per line [default: those of the text model]
+    #[arg(long, value_name = "FILE", requires = "by_object")]
+    pub vocabulary: Option<PathBuf>,
     /// Cameras to look from: transforms.json, a COLMAP model or cameras.json [default: those of the
     /// photos]
     #[arg(long, value_name = "FILE")]
@@ -147,11 +152,14 @@ pub fn mesh(args: &MeshArgs) -> Result<()> {
     if args.collider != ColliderKind::None && !format.has_colliders() {
         return Err(Error::input("--collider: a .ply holds one mesh; write a .glb or .obj"));
     }
-    let inputs: Vec<&Path> =
-        std::iter::once(&args.scene).chain(&args.cameras).map(PathBuf::as_path).collect();
+    let inputs: Vec<&Path> = [Some(&args.scene), args.cameras.as_ref(), args.vocabulary.as_ref()]
+        .into_iter()
+        .flatten()
+        .map(PathBuf::as_path)
+        .collect();
     let out = WrittenFile::open(&args.file, args.force, &inputs)?;
-    let scene = scene::load(&args.scene)?;
-    let things = if args.by_object { Some(things(&scene)?) } else { None };
+    let mut scene = scene::load(&args.scene)?;
+    let things = if args.by_object { Some(things(&mut scene, args)?) } else { None };
     let given = args.cameras.as_deref().map(views::read).transpose()?;
     let cameras = given.as_deref().unwrap_or(&scene.cameras);
     let name = scene_name(&args.scene);
@@ -177,13 +185,19 @@ pub fn mesh(args: &MeshArgs) -> Result<()> {
     }
 }
 
-/// The things of a scene for `--by-object`. This is the one place that joins `splatvk mesh` with the
-/// list of things.
-fn things(scene: &Scene) -> Result<Things> {
-    Err(Error::input(format!(
-        "{}: --by-object needs a list of things, which this version does not make; leave --by-object out",
-        scene.path.display()
-    )))
+/// The things of a scene as a whole, for `--by-object`.
+fn things(scene: &mut Scene, args: &MeshArgs) -> Result<Things> {
+    let vocabulary = args.vocabulary.as_deref().map(objects::vocabulary).transpose()?;
+    let options = ObjectOptions { vocabulary, ..ObjectOptions::default() };
+    let (_, list) = objects::listed(scene, &args.device, &options)?;
+    let whole = LEVEL_NAMES.len() - 1;
+    let mut things = Things { object: vec![0; scene.splats.len()], names: Vec::new() };
+    for object in list.into_iter().filter(|o| o.thing.level == whole) {
+        things.names.push(object.name);
+        let number = things.names.len() as u32;
+        object.thing.instance.splats.iter().for_each(|i| things.object[*i] = number);
+    }
+    Ok(things)
 }
 
 fn options(args: &MeshArgs, scene: &Scene) -> Result<MeshOptions> {
@@ -193,13 +207,6 @@ fn options(args: &MeshArgs, scene: &Scene) -> Result<MeshOptions> {
         simplify: units(args.error)?.map_or(Simplify::Triangles(args.triangles), Simplify::Error),
         fill_guessed: args.fill_guessed,
     })
-}
-
-/// Name of a scene: that of its folder or file.
-fn scene_name(path: &Path) -> String {
-    let whole = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
-    let name = whole.file_stem().map(|n| n.to_string_lossy().into_owned());
-    name.unwrap_or_else(|| "scene".to_owned())
 }
 
 /// Figures of a mesh, lengths in the units of the file.

@@ -4,18 +4,18 @@ use super::export::placement::{Asked, Placement};
 use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::progress;
-use super::scene;
+use super::scene::{self, scene_name};
 use super::views;
+use crate::format::gaussians::gltf::{self, Node};
 use crate::format::gaussians::{FORMATS, SplatFormat, WriteOptions, write_as};
 use crate::format::ply::{self, PlyOptions};
 use crate::format::scene_dir::Scene;
 use crate::format::{picture, write_json};
-use crate::query::things;
 use crate::report::file_name;
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
 use crate::run::objects::{self, NOUNS, Object, ObjectOptions};
-use crate::scene::LEVEL_NAMES;
+use crate::scene::{LEVEL_NAMES, Splats};
 use crate::{Error, Result, files, gpu};
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueEnum};
@@ -61,7 +61,7 @@ pub struct ObjectsArgs {
     #[arg(long, value_name = "FILE")]
     pub vocabulary: Option<PathBuf>,
     /// Smallest share of the opacity of the scene that is a thing
-    #[arg(long, default_value_t = 0.001, value_name = "SHARE", value_parser = share)]
+    #[arg(long, default_value_t = objects::LEAST_SHARE, value_name = "SHARE", value_parser = share)]
     pub min_share: f64,
     /// Format of the file of each thing
     #[arg(long, default_value = "ply", value_parser = PossibleValuesParser::new(FORMATS.iter().map(|f| f.name)), value_name = "FORMAT")]
@@ -78,6 +78,37 @@ pub struct ObjectsArgs {
     pub device: DeviceArgs,
 }
 
+/// The things of a scene, whose language moves onto the device.
+///
+/// # Errors
+/// A scene without language or without cameras.
+pub fn listed(
+    scene: &mut Scene,
+    device: &DeviceArgs,
+    options: &ObjectOptions,
+) -> Result<(QueryScene, Vec<Object>)> {
+    if scene.cameras.is_empty() {
+        return Err(Error::input(format!(
+            "{}: a file of Gaussians has no views that show its things; splatvk label makes a scene of it",
+            scene.path.display()
+        )));
+    }
+    let no_language = || {
+        Error::input(format!(
+            "{}: the scene has no language; splatvk label gives it one, splatvk run makes scenes with it",
+            scene.path.display()
+        ))
+    };
+    scene.language.as_ref().ok_or_else(no_language)?;
+    let encoder = encoder::of_scene(&scene, device.registry()?)?;
+    let gpu = gpu::open(device.device.as_deref())?;
+    let field = scene.language.take().ok_or_else(no_language)?;
+    let mut ready = QueryScene::open(&gpu, (&scene.splats, &scene.cameras), field, encoder)?;
+    ready.set_views(&scene.cameras)?;
+    let list = objects::list(&mut ready, &scene.cameras, options, progress::reporter().as_ref())?;
+    Ok((ready, list))
+}
+
 pub fn objects(args: &ObjectsArgs) -> Result<()> {
     let inputs: Vec<&Path> =
         [Some(args.scene.as_path()), args.vocabulary.as_deref()].into_iter().flatten().collect();
@@ -85,27 +116,8 @@ pub fn objects(args: &ObjectsArgs) -> Result<()> {
         args.out.as_deref().map(|folder| WrittenFiles::open(folder, args.force, &inputs)).transpose()?;
     let vocabulary = args.vocabulary.as_deref().map(vocabulary).transpose()?;
     let mut scene = scene::load(&args.scene)?;
-    if scene.cameras.is_empty() {
-        return Err(Error::input(format!(
-            "{}: a file of Gaussians has no views that show its things; splatvk label makes a scene of it",
-            args.scene.display()
-        )));
-    }
-    let no_language = || {
-        Error::input(format!(
-            "{}: the scene has no language; splatvk label gives it one, splatvk run makes scenes with it",
-            args.scene.display()
-        ))
-    };
-    scene.language.as_ref().ok_or_else(no_language)?;
-    let encoder = encoder::of_scene(&scene, args.device.registry()?)?;
-    let device = gpu::open(args.device.device.as_deref())?;
-    let field = scene.language.take().ok_or_else(no_language)?;
-    let progress = progress::reporter();
-    let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
-    ready.set_views(&scene.cameras)?;
     let options = ObjectOptions { vocabulary, least_share: args.min_share };
-    let list = objects::list(&mut ready, &scene.cameras, &options, progress.as_ref())?;
+    let (ready, list) = listed(&mut scene, &args.device, &options)?;
     let stems = views::stems(&scene.cameras)?;
     let mut entries: Vec<Value> = list.iter().map(|o| o.record(&list, &stems, &scene.world)).collect();
     let mut report = json!({
@@ -116,7 +128,7 @@ pub fn objects(args: &ObjectsArgs) -> Result<()> {
         let asked = Asked { raw: args.raw, ..Asked::default() };
         let placement = Placement::new(&scene, asked, &args.format)?;
         placement.apply(&mut scene, &mut None);
-        progress.inform(&format!("files are {}", placement.text()));
+        progress::reporter().inform(&format!("files are {}", placement.text()));
         report["files"] = placement.json();
         write_files(args, out, &scene, &ready, &list, &mut entries)?;
     }
@@ -132,7 +144,7 @@ pub fn objects(args: &ObjectsArgs) -> Result<()> {
 }
 
 /// Reads the lines of a vocabulary.
-fn vocabulary(path: &Path) -> Result<Vec<String>> {
+pub fn vocabulary(path: &Path) -> Result<Vec<String>> {
     let text = files::read_text(path)?;
     let mut words: Vec<String> = Vec::new();
     for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
@@ -176,14 +188,35 @@ fn write_files(
             entry["picture"] = name.into();
         }
     }
-    let things: Vec<_> = list.iter().map(|o| o.thing.clone()).collect();
-    let numbers = things::numbers(&things, level, scene.splats.len());
+    let numbers = objects::numbers(list, level, scene.splats.len());
+    write_nodes(args, &out.file("scene.glb")?, scene, list)?;
     let options = PlyOptions { objects: Some(&numbers), ..PlyOptions::default() };
     ply::write_splats(&out.file("scene.ply")?, &scene.splats, options)?;
     let csv = csv(list, &scene.world);
     let path = out.file("objects.csv")?;
     std::fs::write(&path, csv).map_err(Error::unwritable(&path))
 }
+
+/// Writes the scene with a named node per thing of the level, and one for the rest.
+fn write_nodes(args: &ObjectsArgs, path: &Path, scene: &Scene, list: &[Object]) -> Result<()> {
+    let of_level: Vec<&Object> = list.iter().filter(|o| o.thing.level == args.level.index()).collect();
+    let mut parts: Vec<Splats> =
+        of_level.iter().map(|o| scene.splats.picked(&o.thing.instance.splats)).collect();
+    let numbers = objects::numbers(list, args.level.index(), scene.splats.len());
+    let rest: Vec<usize> = (0..numbers.len()).filter(|i| numbers[*i] == 0).collect();
+    let mut names: Vec<(&str, Value)> =
+        of_level.iter().map(|o| (o.name.as_str(), json!({ "id": o.id(), "named": o.is_named }))).collect();
+    if !rest.is_empty() {
+        parts.push(scene.splats.picked(&rest));
+        names.push((REST, json!({})));
+    }
+    let nodes = names.into_iter().zip(&parts);
+    let nodes: Vec<Node> = nodes.map(|((name, extras), splats)| Node { name, splats, extras }).collect();
+    gltf::write_nodes(path, &scene_name(&args.scene), &nodes)
+}
+
+/// Name of the splats of no thing.
+const REST: &str = "rest";
 
 /// A row per thing.
 fn csv(list: &[Object], world: &crate::scene::World) -> String {

@@ -26,3 +26,10 @@ pub fn title(path: &Path) -> String {
     let path = path.canonicalize().unwrap_or_else(|_| path.to_owned());
     path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
 }
+
+/// Name of a scene: that of its folder or file.
+pub fn scene_name(path: &Path) -> String {
+    let whole = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    let name = whole.file_stem().map(|n| n.to_string_lossy().into_owned());
+    name.unwrap_or_else(|| "scene".to_owned())
+}

@@ -8,7 +8,7 @@ use crate::query::QueryOptions;
 use crate::query::instances::Instance;
 use crate::query::phrasing;
 use crate::query::presence::Presence;
-use crate::query::things::Thing;
+use crate::query::things::{self, Thing};
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, World};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -33,6 +33,15 @@ pub struct ObjectOptions {
     /// Least share of the opacity of the scene.
     pub least_share: f64,
 }
+
+impl Default for ObjectOptions {
+    fn default() -> Self {
+        ObjectOptions { vocabulary: None, least_share: LEAST_SHARE }
+    }
+}
+
+/// Default of [`ObjectOptions::least_share`].
+pub const LEAST_SHARE: f64 = 0.001;
 
 /// A name that fits a thing.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -266,6 +275,11 @@ fn bounds(pixels: &[[f64; 2]]) -> [[f64; 2]; 2] {
         pixels.iter().fold([from; 2], |b, p| [pick(b[0], p[0]), pick(b[1], p[1])])
     };
     [extreme(f64::min, f64::INFINITY), extreme(f64::max, f64::NEG_INFINITY)]
+}
+
+/// Number of the thing of every splat on a level, [splats]; 0 for splats of none.
+pub fn numbers(objects: &[Object], level: usize, splats: usize) -> Vec<u32> {
+    things::numbers(objects.iter().map(|o| &o.thing), level, splats)
 }
 
 /// Number of objects per level, coarsest first, with the number of named ones.

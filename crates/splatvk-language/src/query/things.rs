@@ -77,9 +77,9 @@ impl Places {
 }
 
 /// Number of the thing of every splat on a level, [splats]; 0 for splats of none.
-pub fn numbers(things: &[Thing], level: usize, splats: usize) -> Vec<u32> {
+pub fn numbers<'a>(things: impl Iterator<Item = &'a Thing>, level: usize, splats: usize) -> Vec<u32> {
     let mut numbers = vec![0; splats];
-    for thing in things.iter().filter(|thing| thing.level == level) {
+    for thing in things.filter(|thing| thing.level == level) {
         thing.instance.splats.iter().for_each(|i| numbers[*i] = thing.number());
     }
     numbers
@@ -154,7 +154,7 @@ mod tests {
     fn every_splat_has_one_number() {
         let (splats, field) = scene();
         let things = Places::of(&splats, &field).things(0.05);
-        let numbers = numbers(&things, 2, splats.len());
+        let numbers = numbers(things.iter(), 2, splats.len());
         assert_eq!((numbers[0], numbers[20], numbers[40], numbers[101]), (1, 65537, 2, 0));
         assert!(Places::of(&splats, &field).things(0.3).iter().all(|t| t.instance.share >= 0.3));
     }

@@ -18,4 +18,4 @@ mod read;
 mod write;
 
 pub use read::read_noted;
-pub use write::{write_glb, write_gltf};
+pub use write::{Node, write_glb, write_gltf, write_nodes};

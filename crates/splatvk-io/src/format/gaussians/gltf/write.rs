@@ -28,11 +28,57 @@ pub fn write_gltf(path: &Path, splats: &Splats) -> Result<()> {
     std::fs::write(path, root.to_string()).map_err(Error::unwritable(path))
 }
 
-/// Document without its buffer, and the buffer.
+/// Splats with a name, as a node of a file.
+pub struct Node<'a> {
+    /// Name, as other programs list it.
+    pub name: &'a str,
+    /// The splats.
+    pub splats: &'a Splats,
+    /// Application data of the node, an object.
+    pub extras: Value,
+}
+
+/// Writes a binary file with a node per entry below one node of the name `root`.
+pub fn write_nodes(path: &Path, root: &str, nodes: &[Node]) -> Result<()> {
+    nodes.iter().try_for_each(|node| usable::check_written(node.splats))?;
+    let mut numbers = Numbers::default();
+    let mesh =
+        |node: &Node| json!({ "name": node.name, "primitives": [primitive(node.splats, &mut numbers)] });
+    let meshes: Vec<Value> = nodes.iter().map(mesh).collect();
+    let children: Vec<usize> = (1..=nodes.len()).collect();
+    let mut list = vec![json!({ "name": root, "children": children })];
+    let named = nodes.iter().enumerate();
+    list.extend(named.map(|(k, node)| json!({ "name": node.name, "mesh": k, "extras": node.extras })));
+    let (root, data) = with_nodes(&list, &meshes, numbers);
+    glb::write(path, root, data)
+}
+
+/// Document of one node without its buffer, and the buffer.
 fn document(splats: &Splats) -> (Value, Vec<u8>) {
+    let mut numbers = Numbers::default();
+    let mesh = json!({ "primitives": [primitive(splats, &mut numbers)] });
+    with_nodes(&[json!({ "mesh": 0 })], &[mesh], numbers)
+}
+
+/// Document without its buffer, and the buffer. The first node is the root.
+fn with_nodes(nodes: &[Value], meshes: &[Value], numbers: Numbers) -> (Value, Vec<u8>) {
+    let root = json!({
+        "asset": { "version": "2.0", "generator": concat!("splatvk ", env!("CARGO_PKG_VERSION")) },
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{ "nodes": [0] }],
+        "nodes": nodes,
+        "meshes": meshes,
+        "accessors": numbers.accessors,
+        "bufferViews": numbers.views,
+    });
+    (root, numbers.data)
+}
+
+/// Appends the attributes of splats and returns their primitive.
+fn primitive(splats: &Splats, numbers: &mut Numbers) -> Value {
     let mut s = splats.clone();
     transform::transform_splats(&mut s, &turned());
-    let mut numbers = Numbers::default();
     let mut attributes = serde_json::Map::new();
     attributes.insert("POSITION".into(), json!(numbers.positions(&s.means)));
     let rotations: Vec<f32> = s
@@ -64,26 +110,16 @@ fn document(splats: &Splats) -> (Value, Vec<u8>) {
         .flat_map(|(dc, a)| [linear(dc[0]), linear(dc[1]), linear(dc[2]), *a])
         .collect();
     attributes.insert("COLOR_0".into(), json!(numbers.shares("VEC4", 4, &fallback)));
-    let root = json!({
-        "asset": { "version": "2.0", "generator": concat!("splatvk ", env!("CARGO_PKG_VERSION")) },
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{ "nodes": [0] }],
-        "nodes": [{ "mesh": 0 }],
-        "meshes": [{ "primitives": [{
-            "mode": 0,
-            "attributes": attributes,
-            "extensions": { EXTENSION: {
-                "kernel": "ellipse",
-                "colorSpace": "srgb_rec709_display",
-                "projection": "perspective",
-                "sortingMethod": "cameraDistance"
-            } }
-        }] }],
-        "accessors": numbers.accessors,
-        "bufferViews": numbers.views,
-    });
-    (root, numbers.data)
+    json!({
+        "mode": 0,
+        "attributes": attributes,
+        "extensions": { EXTENSION: {
+            "kernel": "ellipse",
+            "colorSpace": "srgb_rec709_display",
+            "projection": "perspective",
+            "sortingMethod": "cameraDistance"
+        } }
+    })
 }
 
 /// Base colour of a splat in linear light, as glTF's vertex colours are.
