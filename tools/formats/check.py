@@ -481,6 +481,7 @@ def json_formats():
     events |= said("eval", "eval", SCENE, "--ground-truth", truth, "--out", WORK / "eval", "--json")
     hold("eval", json.loads((WORK / "eval/eval.json").read_text()), "eval.json")
     events |= said("measure", "measure", SCENE, "0,0,1 - 1,0,1", "--json")
+    events |= said("objects", "objects", SCENE, "--json")
     events |= said("models-list", "models", "list", "--json")
     events |= said("doctor", "doctor", "--json")
     said(None, "bench", "--splats", 500, "--width", 64, "--height", 48, "--features", 0, "--repeats", 1, "--json",
