@@ -100,7 +100,7 @@ pub fn listed(
         ))
     };
     scene.language.as_ref().ok_or_else(no_language)?;
-    let encoder = encoder::of_scene(&scene, device.registry()?)?;
+    let encoder = encoder::of_scene(scene, device.registry()?)?;
     let gpu = gpu::open(device.device.as_deref())?;
     let field = scene.language.take().ok_or_else(no_language)?;
     let mut ready = QueryScene::open(&gpu, (&scene.splats, &scene.cameras), field, encoder)?;

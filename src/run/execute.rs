@@ -70,7 +70,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let reconstruction = Reconstruction {
         config: &plan.config,
         queries,
-        start: base.map_or(Start::Photos(origin), Start::Scene),
+        start: base.map_or(Start::Photos(origin.map(Box::new)), Start::Scene),
         remaining: &remaining,
         preview: Some(Preview::of(&workspace, &plan.output.out)),
     };
@@ -100,7 +100,7 @@ pub fn reconstruct(
     let reconstruction = Reconstruction {
         config,
         queries: &extras.queries,
-        start: Start::Photos(given),
+        start: Start::Photos(given.map(Box::new)),
         remaining: &remaining,
         preview: None,
     };
@@ -120,11 +120,11 @@ pub fn save(outcome: &mut RunOutcome, out: &Path, force: bool, progress: &dyn Pr
 /// Begin of a reconstruction.
 pub(super) enum Start {
     /// Photos, with given cameras or geometry instead of the source of the configuration.
-    Photos(Option<CameraOrigin>),
+    Photos(Option<Box<CameraOrigin>>),
     /// A scene that photos join.
     Scene(Arc<BaseScene>),
     /// Splats that get language.
-    Splats(GivenViews),
+    Splats(Box<GivenViews>),
 }
 
 /// A reconstruction whose photos are read.
@@ -149,7 +149,7 @@ impl Reconstruction<'_> {
         // Everything that can be refused is read before the long stages.
         config.check()?;
         // Given cameras and points need no network.
-        let given = matches!(start, Start::Photos(Some(CameraOrigin::GivenGeometry(_))));
+        let given = matches!(&start, Start::Photos(Some(origin)) if matches!(**origin, CameraOrigin::GivenGeometry(_)));
         let needs_networks = config.language.is_some() || !given;
         if needs_networks {
             registry.compute().report(progress)?;
@@ -174,11 +174,11 @@ impl Reconstruction<'_> {
         let mut plan = ScenePlan { build, config, queries, device, preview };
         let (mut base, mut full_colour) = (None, None);
         let scene = match start {
-            Start::Photos(origin) => plan.scene(photos, origin)?,
+            Start::Photos(origin) => plan.scene(photos, origin.map(|origin| *origin))?,
             Start::Scene(scene) => plan.added(base.insert(scene), photos)?,
             Start::Splats(mut views) => {
                 full_colour = Some((std::mem::take(&mut views.frames), views.shows_photos));
-                plan.labelled(views)?
+                plan.labelled(*views)?
             }
         };
         let mut made = plan.build.graph.run(&scene.targets(), device, registry, store, progress)?;

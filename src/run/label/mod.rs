@@ -63,7 +63,7 @@ pub(super) fn run(plan: &RunPlan, path: &Path, progress: &dyn Progress) -> Resul
     let reconstruction = Reconstruction {
         config: &plan.config,
         queries: &plan.inputs.queries,
-        start: Start::Splats(views),
+        start: Start::Splats(Box::new(views)),
         remaining: &remaining,
         preview: None,
     };
