@@ -32,7 +32,7 @@ pub struct ExportArgs {
     /// File, or folder (colmap, colmap-bin)
     #[arg(required_unless_present = "out")]
     pub file: Option<PathBuf>,
-    /// The same as FILE
+    /// FILE as an option
     #[arg(long, value_name = "PATH", conflicts_with = "file")]
     pub out: Option<PathBuf>,
     /// Format of the file; language goes beside the files of Gaussians, into FILE.language.npz

@@ -199,19 +199,7 @@ fn page(
     (no_questions, lifetime): (Option<&str>, Lifetime),
 ) -> Result<String> {
     let (images, title) = (scene::photos(scene), scene::title(path));
-    let view = Scene3d {
-        title: &title,
-        splats: &scene.splats,
-        seen: &scene.seen,
-        backdrop: &scene.backdrop,
-        cameras: &scene.cameras,
-        world: &scene.world,
-        photos: images.iter().collect(),
-        language: scene.language.as_ref(),
-        names,
-        answers: Vec::new(),
-        suggested,
-    };
+    let view = Scene3d { suggested, ..Scene3d::of(scene, &title, &images, names) };
     view.served(no_questions, lifetime)
 }
 

@@ -16,6 +16,13 @@ const ADDABLE: &str = "--add takes a scene that splatvk run wrote";
 pub fn record_of(scene: &Path) -> Result<RunRecord> {
     let record = record::read(scene, ADDABLE)?;
     let file = scene.join("run.json");
+    if record.config.plan.inputs.splats.is_some() {
+        return Err(Error::input(format!(
+            "{}: made by splatvk label; photos that join a scene train its splats, and those of another program stay as they are: label \
+             the file again with all photos",
+            scene.join("run.json").display()
+        )));
+    }
     let plan = &record.config.plan.config;
     match plan.language.as_ref().and_then(|l| l.method).map(|m| m.name) {
         Some("sparselgs" | "lift") => Ok(record),
@@ -134,10 +141,14 @@ const SAME: f64 = 0.95;
 
 /// Pearson correlation of the photos' luma thumbnails.
 fn luma_correlation(a: &Photo, b: &Photo) -> f64 {
-    let (a, b) = (luma_thumbnail(a), luma_thumbnail(b));
-    let (ma, mb) = (mean(&a), mean(&b));
+    correlation(&luma_thumbnail(a), &luma_thumbnail(b))
+}
+
+/// Pearson correlation of two lists of one length.
+pub(super) fn correlation(a: &[f32], b: &[f32]) -> f64 {
+    let (ma, mb) = (mean(a), mean(b));
     let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
-    for (x, y) in a.iter().zip(&b) {
+    for (x, y) in a.iter().zip(b) {
         let (x, y) = (f64::from(*x) - ma, f64::from(*y) - mb);
         (ab, aa, bb) = (ab + x * y, aa + x * x, bb + y * y);
     }

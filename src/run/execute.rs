@@ -18,7 +18,7 @@ use crate::infer::{Registry, home};
 use crate::photo::{self, Photo};
 use crate::pipeline::{self, Store};
 use crate::progress::{Progress, Recorded};
-use crate::scene::{LanguageField, World};
+use crate::scene::{LanguageField, Seen, World};
 use crate::{Error, Result};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -205,7 +205,7 @@ impl Reconstruction<'_> {
                 (trained.splats, frames, None)
             }
         };
-        let mut shows_photos = true;
+        let (mut shows_photos, is_trained) = (true, full_colour.is_none());
         if let Some((full, are_photos)) = full_colour {
             frames.iter_mut().zip(full).for_each(|(frame, full)| frame.rendered = full);
             shows_photos = are_photos;
@@ -217,7 +217,11 @@ impl Reconstruction<'_> {
             let new = std::mem::replace(&mut geometry.points, base.points.clone());
             geometry.points.append(new);
         }
-        let seen = super::view::seen(device, &splats, &trained.cameras, progress)?;
+        let seen = match is_trained {
+            true => super::view::seen(device, &splats, &trained.cameras, progress)?,
+            // Those that the views do not show may be anything but guesses of this program.
+            false => Seen::default(),
+        };
         Ok(RunOutcome {
             plan: RunPlan::default(),
             preset,

@@ -136,7 +136,7 @@ fn figures(o: &RunOutcome) -> Vec<Figure> {
         }
     }
     list.extend(sky_figure(&o.photos, &o.geometry.sky));
-    list.push(up_figure(&o.world));
+    list.push(up_figure(&o.world, o.psnr.is_empty()));
     list.push(splats_figure(&o.splats, &o.seen));
     list.extend(view_dependence_figure(&o.rgb.view_dependence));
     list.extend(focal_figure(&o.photos, &o.cameras, &o.geometry.fitted).map(|text| {
@@ -195,8 +195,8 @@ fn view_dependence_figure(found: &ViewDependence) -> Option<Figure> {
     Some(Figure::new("colours", text, "Colours depend on the direction, as on shiny things."))
 }
 
-/// Uncertainty of the direction up, with its evidence.
-fn up_figure(world: &World) -> Figure {
+/// Uncertainty of the direction up, with its evidence; photos alone are evidence.
+fn up_figure(world: &World, are_renders: bool) -> Figure {
     match &world.up {
         Some(up) => {
             let evidence: Vec<&str> = up.evidence.iter().map(|e| e.text()).collect();
@@ -205,7 +205,12 @@ fn up_figure(world: &World) -> Figure {
         }
         None => Figure::that_matters(
             "up",
-            "not known: too few edges and surfaces agree on one direction".to_owned(),
+            match are_renders {
+                true => {
+                    "not known: the views were placed by an assumption, and no photo confirms it".to_owned()
+                }
+                false => "not known: too few edges and surfaces agree on one direction".to_owned(),
+            },
             "The scene may stand tilted in other programs.",
         ),
     }

@@ -350,7 +350,7 @@ fn sog_of_splat_transform_is_read() {
     let own = |i: &usize| max_difference(&back.sh[27 * i + 3..][..24], &s.sh[27 * i + 3..][..24]) < 0.01;
     assert!((0..24).filter(own).count() >= 8, "{}", (0..24).filter(own).count());
 
-    // The same files in a folder, and what they may not be.
+    // Unpacked files in a folder, and refused ones.
     let folder = tempfile::tempdir().unwrap();
     let file = std::fs::File::open(data("formats/sh2.sog")).unwrap();
     zip::ZipArchive::new(file).unwrap().extract(folder.path()).unwrap();

@@ -26,19 +26,8 @@ pub(super) fn write(args: &ExportArgs, scene: &Scene, file: WrittenFile) -> Resu
     }
     let images = scene::photos(scene);
     let title = args.title.clone().unwrap_or_else(|| scene::title(&args.scene));
-    let view = Scene3d {
-        title: &title,
-        splats: &scene.splats,
-        seen: &scene.seen,
-        backdrop: &scene.backdrop,
-        cameras: &scene.cameras,
-        world: &scene.world,
-        photos: images.iter().collect(),
-        language: scene.language.as_ref(),
-        names: &CodeNames::new(),
-        answers: Vec::new(),
-        suggested: Vec::new(),
-    };
+    let names = CodeNames::new();
+    let view = Scene3d::of(scene, &title, &images, &names);
     let page = view.presented()?;
     file.keep(|path| std::fs::write(path, &page.html).map_err(Error::unwritable(path)))?;
     let up = scene.world.up.as_ref();

@@ -11,6 +11,7 @@ use super::chart::escape;
 use super::{colour, thousands};
 use crate::Result;
 use crate::format::picture;
+use crate::format::scene_dir::Scene;
 use crate::query::clicks::Standing;
 use crate::query::highlight::Highlight;
 use crate::query::presence::Presence;
@@ -112,6 +113,25 @@ pub struct Scene3d<'a> {
     pub answers: Vec<ShownAnswer<'a>>,
     /// Queries to choose from.
     pub suggested: Vec<String>,
+}
+
+impl<'a> Scene3d<'a> {
+    /// A loaded scene, without answers and suggestions.
+    pub fn of(scene: &'a Scene, title: &'a str, photos: &'a [RgbImage], names: &'a CodeNames) -> Scene3d<'a> {
+        Scene3d {
+            title,
+            splats: &scene.splats,
+            seen: &scene.seen,
+            backdrop: &scene.backdrop,
+            cameras: &scene.cameras,
+            world: &scene.world,
+            photos: photos.iter().collect(),
+            language: scene.language.as_ref(),
+            names,
+            answers: Vec::new(),
+            suggested: Vec::new(),
+        }
+    }
 }
 
 /// A page for presentation.

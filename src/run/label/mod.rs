@@ -18,7 +18,7 @@ use crate::pass::renderer::{RenderedFrame, Renderer};
 use crate::photo::{self, Photo};
 use crate::pose::Geometry;
 use crate::progress::{Progress, Recorded};
-use crate::scene::{Camera, DepthMap, Image, PointCloud, World};
+use crate::scene::{Camera, DepthMap, PointCloud, World};
 use crate::{Error, Result, files};
 use glam::DVec2;
 use std::path::Path;
@@ -84,7 +84,6 @@ fn finished(mut made: RunOutcome, scene: Scene, plan: &RunPlan) -> RunOutcome {
         world: World { up, scale: world.scale },
         rgb: crate::fit::FitStats { splats: [count; 2], ..Default::default() },
         splats,
-        // Splats that the views do not show may be anything but guesses.
         seen,
         backdrop,
         ..made
@@ -93,28 +92,18 @@ fn finished(mut made: RunOutcome, scene: Scene, plan: &RunPlan) -> RunOutcome {
 
 /// Pixels between points that are taken from a depth map.
 const POINT_STEP: usize = 6;
-/// Confidence of rendered depth.
-const CONFIDENCE: f32 = 0.9;
 
 /// Cameras, rendered depth and points of the views.
 fn geometry(cameras: &[Camera], frames: &[RenderedFrame], photos: &[Photo], method: &str) -> Geometry {
     let mut points = PointCloud::default();
     let mut depths = Vec::with_capacity(frames.len());
     for (view, ((camera, frame), photo)) in cameras.iter().zip(frames).zip(photos).enumerate() {
-        let mut depth = trusted(&frame.depth);
+        let mut depth = DepthMap::rendered(frame.depth.clone());
         depth.keep(|i| photo.uses(i));
         add_points(&mut points, view, camera, &depth, photo);
         depths.push(depth);
     }
     Geometry { cameras: cameras.to_vec(), depths, points, method: method.to_owned(), ..Geometry::default() }
-}
-
-fn trusted(depth: &Image<f32>) -> DepthMap {
-    let confidence = depth.data.iter().map(|z| if *z > 0.0 { CONFIDENCE } else { 0.0 }).collect();
-    DepthMap {
-        confidence: Image { width: depth.width, height: depth.height, data: confidence },
-        depth: depth.clone(),
-    }
 }
 
 /// Appends the points of every [`POINT_STEP`]th pixel with depth.
@@ -131,7 +120,7 @@ fn add_points(points: &mut PointCloud, view: usize, camera: &Camera, depth: &Dep
             let point = inverse.transform(camera.ray(pixel) * f64::from(z));
             points.positions.push(point.as_vec3().to_array());
             points.colours.push(photo.image.at(x, y));
-            points.confidence.push(CONFIDENCE);
+            points.confidence.push(depth.confidence.data[y * width + x]);
             points.view.push(view as u32);
             points.radius.push(z / camera.fx as f32);
         }

@@ -1,4 +1,5 @@
 //! Occupied and free space of splats, on a grid, and rays through it.
+use crate::math::sigmoid;
 use crate::scene::Splats;
 use glam::{DMat3, DQuat, DVec3, IVec3, Vec3};
 use rayon::prelude::*;
@@ -70,7 +71,7 @@ impl Space {
         let mut order = [0, 1, 2];
         order.sort_by(|a, b| scales[*b].total_cmp(&scales[*a]));
         let [u, v] = [order[0], order[1]].map(|k| DVec3::from(axes[k]) * scales[k]);
-        let opacity = 1.0 / (1.0 + f64::from(-splats.opacity_logits[i]).exp());
+        let opacity = f64::from(sigmoid(splats.opacity_logits[i]));
         // Area of the ellipse that would block as much light with full opacity: 2π σ_u σ_v.
         let area = std::f64::consts::TAU * u.length() * v.length() * opacity / (self.cell * self.cell);
         let [nu, nv] =
@@ -146,7 +147,7 @@ fn mass_box(splats: &Splats) -> Option<(DVec3, DVec3)> {
         .map(|i| {
             let mut scales = splats.log_scales[i].map(|s| f64::from(s).exp());
             scales.sort_by(f64::total_cmp);
-            let opacity = 1.0 / (1.0 + f64::from(-splats.opacity_logits[i]).exp());
+            let opacity = f64::from(sigmoid(splats.opacity_logits[i]));
             (Vec3::from(splats.means[i]).as_dvec3(), opacity * scales[1] * scales[2])
         })
         .collect();

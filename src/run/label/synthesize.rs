@@ -82,14 +82,19 @@ pub(super) fn cameras(
     let space = Space::new(splats).ok_or_else(blind)?;
     let views = promising(&space, up, RENDERED * wanted);
     progress.begin("views", views.len() as u64);
-    let (mut rendered, mut weights) = (Vec::new(), Vec::new());
+    let (mut rendered, mut weights, mut refused) = (Vec::new(), Vec::new(), None);
     for (done, View { camera, .. }) in views.into_iter().enumerate() {
         progress.check()?;
         let small = camera.resized(TRIED_SIDE, TRIED_SIDE * camera.height / camera.width);
         // A view from far away has more splats per tile than some devices take.
-        if let Some(frame) = skipping_crowded(renderer.render(&small))?
-            && shows_things(&frame)
-        {
+        let frame = match renderer.render(&small) {
+            Err(error @ Error::Gpu { source: None, .. }) => {
+                refused = Some(error);
+                RenderedFrame::default()
+            }
+            frame => frame?,
+        };
+        if shows_things(&frame) {
             let mut sharp = renderer.weights(&small)?;
             let share = keep_sharp(&mut sharp, splats, &camera);
             let opaque = frame.alpha.data.iter().filter(|a| **a >= OPAQUE).count();
@@ -106,22 +111,13 @@ pub(super) fn cameras(
     let of_kept: Vec<Shown> = kept.iter().map(|v| std::mem::take(&mut weights[*v])).collect();
     let chosen = most_covering(&of_kept, wanted, LEAST_GAIN);
     if chosen.is_empty() {
-        return Err(blind());
+        return Err(refused.unwrap_or_else(blind));
     }
     let named = |(number, chosen): (usize, &usize)| Camera {
         name: format!("view_{:02}.png", number + 1),
         ..rendered[kept[*chosen]].0.clone()
     };
     Ok(chosen.iter().enumerate().map(named).collect())
-}
-
-/// The result, or `None` where a device refuses a view.
-fn skipping_crowded<T>(result: Result<T>) -> Result<Option<T>> {
-    match result {
-        Ok(value) => Ok(Some(value)),
-        Err(Error::Gpu { source: None, .. }) => Ok(None),
-        Err(error) => Err(error),
-    }
 }
 
 /// Clears the weights of splats that are large in the picture; returns the share of the others.
@@ -341,5 +337,35 @@ mod tests {
         }
         assert!(likely_up(&splats).angle_between(tilt * DVec3::NEG_Y).to_degrees() < 1.0);
         assert_eq!(likely_up(&Splats::default()), DVec3::NEG_Y);
+    }
+
+    /// A wall whose left half has fine splats, and whose right half has coarse ones. Both block the
+    /// light: of fine ones, twelve lie at each place.
+    fn half_sharp() -> Splats {
+        let mut splats = Splats::default();
+        for (x, y) in (-40..40).flat_map(|x| (-30..30).map(move |y| (x, y))) {
+            let (sigma, copies) = if x < 0 { (0.006f32, 12) } else { (0.2, 1) };
+            for _ in 0..copies {
+                splats.means.push([0.025 * x as f32, 0.025 * y as f32, 0.0]);
+                splats.log_scales.push([sigma.ln(), sigma.ln(), -9.0]);
+                splats.quats.push([1.0, 0.0, 0.0, 0.0]);
+                splats.opacity_logits.push(9.0);
+            }
+        }
+        splats
+    }
+
+    #[test]
+    fn views_look_at_sharp_splats() {
+        let splats = half_sharp();
+        let space = Space::new(&splats).unwrap();
+        let views = promising(&space, DVec3::NEG_Y, 6);
+        assert!(!views.is_empty());
+        for view in &views {
+            // The middle of the picture is in the left half.
+            let (centre, forward) = (view.camera.pose.centre(), view.camera.pose.rotation.row(2));
+            let hit = centre - forward * (centre.z / forward.z);
+            assert!(hit.x < 0.1 && forward.z * centre.z < 0.0, "{} at {hit}", view.quality);
+        }
     }
 }

@@ -7,6 +7,7 @@ use crate::pass::renderer::{RenderedFrame, Renderer};
 use crate::photo::{self, Candidate, Photo};
 use crate::pose;
 use crate::progress::Progress;
+use crate::run::base::correlation;
 use crate::run::photos;
 use crate::run::plan::RunPlan;
 use crate::scene::{Camera, Coverage, Image};
@@ -159,18 +160,6 @@ fn thumbnail(luma: &Image<f32>) -> Vec<f32> {
     let pixels = (0..THUMBNAIL).flat_map(|y| (0..THUMBNAIL).map(move |x| (x, y)));
     let (w, h) = (luma.width, luma.height);
     pixels.map(|(x, y)| luma.data[at(y, THUMBNAIL, h) * w + at(x, THUMBNAIL, w)]).collect()
-}
-
-/// Pearson correlation.
-fn correlation(a: &[f32], b: &[f32]) -> f64 {
-    let mean = |v: &[f32]| v.iter().copied().map(f64::from).sum::<f64>() / v.len().max(1) as f64;
-    let (ma, mb) = (mean(a), mean(b));
-    let (mut ab, mut aa, mut bb) = (0.0, 0.0, 0.0);
-    for (x, y) in a.iter().zip(b) {
-        let (x, y) = (f64::from(*x) - ma, f64::from(*y) - mb);
-        (ab, aa, bb) = (ab + x * y, aa + x * x, bb + y * y);
-    }
-    ab / (aa * bb).sqrt().max(f64::MIN_POSITIVE)
 }
 
 /// The camera at a size of at most `side` pixels on the longer side.

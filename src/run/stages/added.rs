@@ -111,7 +111,7 @@ impl Stage for AddedDepth {
             context.progress,
         )?;
 
-        let mut depths: Vec<DepthMap> = rendered.iter().map(trusted).collect();
+        let mut depths: Vec<DepthMap> = rendered.iter().cloned().map(DepthMap::rendered).collect();
         let mut sky = vec![0.0; all];
         for ((view, depth), share) in views.iter().zip(dense.depths).zip(dense.sky) {
             depths[*view] = depth;
@@ -157,16 +157,6 @@ fn with_neighbours(model: &SparseModel, known: usize, all: usize) -> Vec<usize> 
         views.extend(order.into_iter().take(NEIGHBOURS));
     }
     views.into_iter().collect()
-}
-
-/// Rendered depth with the confidence of depth on which several photos agree: such depth trained
-/// it.
-fn trusted(depth: &Image<f32>) -> DepthMap {
-    let confidence = depth.data.iter().map(|z| if *z > 0.0 { 0.9 } else { 0.0 }).collect();
-    DepthMap {
-        confidence: Image { width: depth.width, height: depth.height, data: confidence },
-        depth: depth.clone(),
-    }
 }
 
 /// Continues training of a scene with all photos.

@@ -81,7 +81,17 @@ pub struct DepthMap {
     pub confidence: Image<f32>,
 }
 
+/// Confidence of rendered depth: that of depth on which several photos agree, which trained it.
+const RENDERED: f32 = 0.9;
+
 impl DepthMap {
+    /// Depth [H, W] that splats render; 0 = unknown.
+    pub fn rendered(depth: Image<f32>) -> DepthMap {
+        let confidence = depth.data.iter().map(|z| if *z > 0.0 { RENDERED } else { 0.0 }).collect();
+        let confidence = Image { width: depth.width, height: depth.height, data: confidence };
+        DepthMap { depth, confidence }
+    }
+
     /// Makes depth unknown where `keep(index)` is false.
     pub fn keep(&mut self, keep: impl Fn(usize) -> bool) {
         for i in (0..self.depth.data.len()).filter(|i| !keep(*i)) {

@@ -51,7 +51,7 @@ impl MeshFormat {
     }
 }
 
-/// What a file says beside the mesh.
+/// Statements of a file beside the mesh.
 #[derive(Clone, Debug)]
 pub struct MeshFile<'a> {
     /// Name of the scene.
