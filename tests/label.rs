@@ -180,5 +180,9 @@ fn label_refuses_views_that_do_not_fit() {
     refuses(&mut label(&one), 2, &["too few or too transparent"]);
     assert!(!folder.path().join("out").exists());
     refuses(splatvk().arg("objects").arg(foreign()), 2, &["splatvk label makes a scene"]);
+    let photo = images.join(format!("{}.png", swapped[0].name));
+    let mut add = splatvk();
+    add.arg("run").arg("--add").arg(labelled()).arg(photo);
+    refuses(&mut add, 2, &["made by splatvk label", "label the file again"]);
     refuses(splatvk().arg("objects").arg(scene()), 2, &["no language", "splatvk label"]);
 }
