@@ -310,6 +310,7 @@ fn model_per_level_decodes_as_trained() {
         splats: &trained.splats,
         seen: &seen,
         backdrop: &Default::default(),
+        holes: &Splats::default(),
         cameras: &cameras,
         world: &World::default(),
         photos: &[],

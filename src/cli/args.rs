@@ -9,6 +9,7 @@ mod shared;
 #[cfg(unix)]
 pub use super::batch::{BatchArgs, BatchRowArgs};
 pub use super::demo::DemoArgs;
+pub use super::edit::EditArgs;
 pub use super::export::ExportArgs;
 pub use super::label::LabelArgs;
 pub use super::measure::MeasureArgs;
@@ -18,7 +19,7 @@ pub use super::run::RunArgs;
 pub use crate::run::config::whole;
 pub use crate::run::config::{EXPERTS, compat_names as compats};
 pub use bench::{BenchArgs, BenchPart};
-pub use shared::{DeviceArgs, GlobalArgs, LogFormat, MACHINE, SavingArgs};
+pub use shared::{DeviceArgs, EditUse, GlobalArgs, LogFormat, MACHINE, SavingArgs};
 
 /// Photos in, a 3D scene that answers text queries out.
 #[derive(Debug, Parser)]
@@ -57,6 +58,8 @@ pub enum Command {
     Export(ExportArgs),
     /// Surfaces of a scene → triangles: .glb, .ply, .obj
     Mesh(MeshArgs),
+    /// Delete, isolate, recolour, move things of a scene, and undo it
+    Edit(EditArgs),
     /// The installed models
     Models(ModelsArgs),
     /// How fast this machine trains and renders
@@ -103,6 +106,7 @@ impl Command {
             Command::Label(args) => &mut args.device,
             Command::Query(args) => &mut args.device,
             Command::Objects(args) => &mut args.device,
+            Command::Edit(args) => &mut args.device,
             Command::View(args) => &mut args.device,
             Command::Eval(args) => &mut args.device,
             Command::Models(args) => match &mut args.action {
@@ -230,6 +234,9 @@ pub struct RenderArgs {
     /// How to write it
     #[arg(long = "format", value_enum, value_delimiter = ',', default_value = "png")]
     pub formats: Vec<ImageFormat>,
+    /// Edits
+    #[command(flatten)]
+    pub edits: EditUse,
     /// Device
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -265,6 +272,9 @@ pub struct QueryArgs {
     /// Choose level, mask and location as others do [default: as the scene was made]
     #[arg(long, value_parser = compats(), value_name = "WHOSE", help_heading = EXPERTS)]
     pub compat: Option<String>,
+    /// Edits
+    #[command(flatten)]
+    pub edits: EditUse,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -279,6 +289,9 @@ pub struct ViewArgs {
     /// Port on 127.0.0.1; 0 takes a free one
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u16>(0..=65_535))]
     pub port: u16,
+    /// Edits
+    #[command(flatten)]
+    pub edits: EditUse,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -318,6 +331,9 @@ pub struct EvalArgs {
     /// Print a short table instead of JSON; --out DIR keeps eval.json
     #[arg(long, conflicts_with = "json")]
     pub text: bool,
+    /// Edits
+    #[command(flatten)]
+    pub edits: EditUse,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

@@ -1,5 +1,5 @@
 //! `splatvk bench`
-use super::args::{BenchArgs, BenchPart};
+use super::args::{BenchArgs, BenchPart, EditUse};
 use super::models::check_text;
 use super::outputs::{WrittenFile, WrittenFiles};
 use super::print::{listing, print};
@@ -162,7 +162,7 @@ fn scene_and_encoder(args: &BenchArgs) -> Result<(scene_dir::Scene, Box<dyn Regi
     let Some(path) = &args.scene else {
         return Err(Error::input("bench query: give a scene with language with --scene DIR"));
     };
-    let scene = scene::load(path)?;
+    let scene = scene::load(path, EditUse::default())?;
     if scene.language.is_none() {
         let path = path.display();
         return Err(Error::input(format!("{path}: the scene has no language; make one with splatvk run")));

@@ -1,5 +1,5 @@
 //! `splatvk demo`: four photos that the program carries, their scene, and words in it.
-use super::args::DeviceArgs;
+use super::args::{DeviceArgs, EditUse};
 use super::print::{print, print_json};
 use super::progress;
 use super::view::Shown;
@@ -75,7 +75,7 @@ pub fn demo(args: &DemoArgs) -> Result<()> {
         };
         joined(finished)?;
         let queries = QUERIES.map(str::to_owned);
-        let shown = Shown::open(&scene, 0, &args.device, &queries)?;
+        let shown = Shown::open((&scene, EditUse::default()), 0, &args.device, &queries)?;
         open_browser(&shown.url());
         shown.serve(false)?;
         joined(running)

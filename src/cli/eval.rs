@@ -28,9 +28,9 @@ pub(super) fn eval(args: &EvalArgs) -> Result<()> {
     let inputs: Vec<&Path> = inputs.into_iter().flatten().collect();
     let open = |out| WrittenFiles::open(out, args.force, &inputs);
     let out = args.out.as_deref().map(open).transpose()?;
-    let mut scene = scene::load(&args.scene)?;
+    let mut scene = scene::load(&args.scene, args.edits)?;
     if let Some(other) = &args.cameras_of {
-        scene.cameras = scene::load(other)?.cameras;
+        scene.cameras = scene::load(other, args.edits)?.cameras;
     }
     let scores = score_scene(&scene, args, out.as_ref())?;
     report(&scores, out, args.text.then(|| scores.text()), args.device.json)

@@ -6,6 +6,7 @@ pub mod placement;
 
 pub use output::{format, is_folder};
 
+use super::args::EditUse;
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
@@ -75,6 +76,9 @@ pub struct ExportArgs {
     /// --up and --metres name
     #[arg(long)]
     pub raw: bool,
+    /// Edits
+    #[command(flatten)]
+    pub edits: EditUse,
     /// Print one JSON object on standard output
     #[arg(long)]
     pub json: bool,
@@ -180,7 +184,7 @@ pub fn write(args: &ExportArgs) -> Result<Exported> {
         return Err(Error::input("--title: only --format html has a heading; leave it out"));
     }
     let out = Output::reserve(args, format)?;
-    let mut scene = scene::load(&args.scene)?;
+    let mut scene = scene::load(&args.scene, args.edits)?;
     let out = match out {
         Output::File(file) if format == "html" => return page::write(args, &scene, file),
         other => other,

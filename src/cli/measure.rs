@@ -1,4 +1,5 @@
 //! `splatvk measure`: lengths in a scene, and its scale.
+use super::args::EditUse;
 use super::print::{print, print_json};
 use super::scene;
 use crate::format::scene_dir;
@@ -26,6 +27,9 @@ pub struct MeasureArgs {
     /// Device, for places given in pixels
     #[arg(long, value_name = "DEVICE")]
     pub device: Option<String>,
+    /// Edits
+    #[command(flatten)]
+    pub edits: EditUse,
     /// Print one JSON object on standard output
     #[arg(long)]
     pub json: bool,
@@ -38,7 +42,7 @@ pub fn measure(args: &MeasureArgs) -> Result<()> {
     if let Some(bare) = args.scale.iter().find(|l| l.metres.is_none()) {
         return Err(Error::input(format!("--scale \"{}\": give its length, \"A - B = METRES\"", bare.text)));
     }
-    let scene = scene::load(&args.scene)?;
+    let scene = scene::load(&args.scene, args.edits)?;
     if scene.cameras.is_empty() {
         return Err(Error::input(format!(
             "{}: a file of Gaussians has no place for a scale; give a scene directory",

@@ -1,5 +1,5 @@
 //! `splatvk mesh`: surfaces of a scene as triangles.
-use super::args::DeviceArgs;
+use super::args::{DeviceArgs, EditUse};
 use super::outputs::WrittenFile;
 use super::print::{print, print_json};
 use super::progress;
@@ -8,6 +8,7 @@ use super::{objects, views};
 use crate::format::mesh::{self as files, MeshFile, MeshFormat};
 use crate::format::scene_dir::Scene;
 use crate::run::mesh::{self, MeshOptions, Placement, SceneMesh, Things};
+use crate::run::metric::Distance;
 use crate::run::objects::ObjectOptions;
 use crate::scene::{LEVEL_NAMES, Mesh, World};
 use crate::{Error, Result};
@@ -15,7 +16,6 @@ use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use splatvk_mesh::{Collider, Simplify};
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 /// `splatvk mesh`
 #[derive(Debug, Args)]
@@ -32,11 +32,11 @@ pub struct MeshArgs {
     pub triangles: usize,
     /// Simplify as far as 99.9 % of the surface moves by at most this length, instead of to a number
     /// of triangles: 2mm, 0.5cm, or a number in the units of the scene
-    #[arg(long, conflicts_with = "triangles", value_name = "LENGTH")]
-    pub error: Option<Length>,
+    #[arg(long, conflicts_with = "triangles", value_name = "LENGTH", value_parser = positive)]
+    pub error: Option<Distance>,
     /// Side of a voxel [default: two pixels of the photos at their surfaces]
-    #[arg(long, value_name = "LENGTH")]
-    pub voxel: Option<Length>,
+    #[arg(long, value_name = "LENGTH", value_parser = positive)]
+    pub voxel: Option<Distance>,
     /// Also surfaces that no photo shows; without it they are holes
     #[arg(long)]
     pub fill_guessed: bool,
@@ -59,6 +59,9 @@ pub struct MeshArgs {
     /// Write over an ordinary file
     #[arg(long)]
     pub force: bool,
+    /// Edits
+    #[command(flatten)]
+    pub edits: EditUse,
     /// Device and output
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -106,45 +109,11 @@ impl ColliderKind {
     }
 }
 
-/// A positive length: metres with m, cm or mm, otherwise units of the scene.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Length {
-    /// Metres.
-    Metres(f64),
-    /// Scene units.
-    Units(f64),
-}
-
-impl FromStr for Length {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Length, String> {
-        let text = text.trim();
-        let metres = [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)];
-        let found = metres.iter().find_map(|(name, unit)| Some((text.strip_suffix(name)?, *unit)));
-        let number = found.map_or(text, |(number, _)| number).trim().parse::<f64>().ok();
-        let number = number.filter(|v| v.is_finite() && *v > 0.0).ok_or_else(|| {
-            format!(
-                "\"{text}\": give a positive length such as 2mm, 0.5cm, or 0.01 in the units of the scene"
-            )
-        })?;
-        Ok(found.map_or(Length::Units(number), |(_, unit)| Length::Metres(number * unit)))
-    }
-}
-
-impl Length {
-    /// Scene units.
-    fn in_units(self, scene: &Scene) -> Result<f64> {
-        match (self, &scene.world.scale) {
-            (Length::Units(units), _) => Ok(units),
-            (Length::Metres(metres), Some(scale)) => Ok(metres / scale.metres_per_unit),
-            (Length::Metres(metres), None) => Err(Error::input(format!(
-                "{}: its scale is not known, so {metres} m cannot be used; state a length with splatvk measure --scale, \
-                 or give a number in the units of the scene",
-                scene.path.display()
-            ))),
-        }
-    }
+/// Parses a positive distance.
+fn positive(text: &str) -> Result<Distance, String> {
+    text.parse().ok().filter(Distance::is_positive).ok_or_else(|| {
+        format!("\"{text}\": give a positive length such as 2mm, 0.5cm, or 0.01 in the units of the scene")
+    })
 }
 
 pub fn mesh(args: &MeshArgs) -> Result<()> {
@@ -158,7 +127,7 @@ pub fn mesh(args: &MeshArgs) -> Result<()> {
         .map(PathBuf::as_path)
         .collect();
     let out = WrittenFile::open(&args.file, args.force, &inputs)?;
-    let mut scene = scene::load(&args.scene)?;
+    let mut scene = scene::load(&args.scene, args.edits)?;
     let things = if args.by_object { Some(things(&mut scene, args)?) } else { None };
     let given = args.cameras.as_deref().map(views::read).transpose()?;
     let cameras = given.as_deref().unwrap_or(&scene.cameras);
@@ -201,7 +170,7 @@ fn things(scene: &mut Scene, args: &MeshArgs) -> Result<Things> {
 }
 
 fn options(args: &MeshArgs, scene: &Scene) -> Result<MeshOptions> {
-    let units = |length: Option<Length>| length.map(|l| l.in_units(scene)).transpose();
+    let units = |length: Option<Distance>| length.map(|l| l.in_units(scene)).transpose();
     Ok(MeshOptions {
         voxel: units(args.voxel)?,
         simplify: units(args.error)?.map_or(Simplify::Triangles(args.triangles), Simplify::Error),
@@ -272,14 +241,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lengths_have_units_or_are_the_scenes() {
-        assert_eq!("2mm".parse(), Ok(Length::Metres(0.002)));
-        assert_eq!(" 0.5 cm".parse(), Ok(Length::Metres(0.005)));
-        assert_eq!("0.01".parse(), Ok(Length::Units(0.01)));
-        for text in ["", "mm", "-1", "0", "inf", "2 inches"] {
-            assert!(text.parse::<Length>().is_err(), "{text}");
+    fn voxels_have_a_size() {
+        assert_eq!(positive("2mm"), Ok(Distance::Metres(0.002)));
+        for text in ["", "-1", "0", "2 inches"] {
+            assert!(positive(text).is_err(), "{text}");
         }
-        let error = Length::Metres(0.002).in_units(&Scene::default()).unwrap_err();
-        assert!(error.exit_code() == 2 && error.to_string().contains("splatvk measure --scale"));
     }
 }

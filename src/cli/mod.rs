@@ -6,6 +6,7 @@ mod bench;
 mod clean;
 mod demo;
 mod doctor;
+mod edit;
 pub mod eval;
 mod export;
 mod fetch;
@@ -133,6 +134,7 @@ impl Program for Cli {
             Command::Measure(args) => measure::measure(&args),
             Command::Export(args) => export::export(&args),
             Command::Mesh(args) => mesh::mesh(&args),
+            Command::Edit(args) => edit::edit(&args),
             Command::Models(args) => models::models(&args),
             Command::Bench(args) => bench::bench(&args),
             #[cfg(unix)]

@@ -1,5 +1,5 @@
 //! `splatvk objects`
-use super::args::{DeviceArgs, share};
+use super::args::{DeviceArgs, EditUse, share};
 use super::export::placement::{Asked, Placement};
 use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
@@ -73,6 +73,9 @@ pub struct ObjectsArgs {
     /// Write over what is there: ordinary files of the same names
     #[arg(long, requires = "out")]
     pub force: bool,
+    /// Edits
+    #[command(flatten)]
+    pub edits: EditUse,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -115,7 +118,7 @@ pub fn objects(args: &ObjectsArgs) -> Result<()> {
     let mut out =
         args.out.as_deref().map(|folder| WrittenFiles::open(folder, args.force, &inputs)).transpose()?;
     let vocabulary = args.vocabulary.as_deref().map(vocabulary).transpose()?;
-    let mut scene = scene::load(&args.scene)?;
+    let mut scene = scene::load(&args.scene, args.edits)?;
     let options = ObjectOptions { vocabulary, least_share: args.min_share };
     let (ready, list) = listed(&mut scene, &args.device, &options)?;
     let stems = views::stems(&scene.cameras)?;

@@ -40,7 +40,7 @@ pub fn query(args: &QueryArgs) -> Result<()> {
     let inputs: Vec<_> = inputs.into_iter().flatten().collect();
     let open = |folder| WrittenFiles::open(folder, args.force, &inputs);
     let mut out = args.out.as_deref().map(open).transpose()?;
-    let mut scene = scene::load(&args.scene)?;
+    let mut scene = scene::load(&args.scene, args.edits)?;
     if scene.language.is_none() && args.concepts.is_none() {
         return Err(no_language(args));
     }

@@ -25,7 +25,7 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     if args.video {
         VideoWriter::check()?;
     }
-    let scene = scene::load(&args.scene)?;
+    let scene = scene::load(&args.scene, args.edits)?;
     let given = args.cameras.as_deref().map(views::read).transpose()?;
     let wants_language = args.channels.iter().any(|c| matches!(c, Channel::Features | Channel::Codes));
     if wants_language && scene.language.is_none() {
@@ -45,7 +45,9 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     let no_language = LanguageField::default();
     let field = if wants_language { scene.language.as_ref().unwrap_or(&no_language) } else { &no_language };
     let device = gpu::open(args.device.device.as_deref())?;
-    let mut viewer = Viewer::new(&device, &scene.splats, field)?.with_backdrop(&scene.backdrop)?;
+    let mut viewer = Viewer::new(&device, &scene.splats, field)?
+        .with_backdrop(&scene.backdrop)?
+        .with_holes(&scene.holes)?;
     let mut unseen =
         wants_unseen.then(|| UnseenShare::new(&device, &scene.splats, &scene.seen)).transpose()?;
     let mut path = match args.path {

@@ -1,4 +1,5 @@
 //! Loading of scenes for commands.
+use super::args::EditUse;
 use super::progress;
 use crate::format::scene_dir::{self, Scene};
 use crate::format::scene_photos;
@@ -6,9 +7,21 @@ use crate::scene::{Camera, RgbImage};
 use crate::{Result, photo};
 use std::path::Path;
 
-/// Loads a scene directory or a file of Gaussians, and prints its warnings.
-pub fn load(path: &Path) -> Result<Scene> {
-    let scene = scene_dir::load(path)?;
+/// Loads a scene directory or a file of Gaussians, and prints its warnings and the number of its
+/// edits.
+pub fn load(path: &Path, edits: EditUse) -> Result<Scene> {
+    let scene = match edits.ignore_edits {
+        true => scene_dir::load_unedited(path)?,
+        false => scene_dir::load(path)?,
+    };
+    if let Some(edits) = &scene.edits {
+        let noun = if edits.count == 1 { "edit" } else { "edits" };
+        progress::reporter().inform(&format!(
+            "{}: with {} {noun} (--ignore-edits leaves them out)",
+            path.display(),
+            edits.count
+        ));
+    }
     scene.warnings.iter().for_each(|note| progress::print_warning(note));
     Ok(scene)
 }

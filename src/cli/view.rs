@@ -1,5 +1,5 @@
 //! `splatvk view`: the interactive view of a scene, served to the browser of this machine.
-use super::args::{DeviceArgs, ViewArgs};
+use super::args::{DeviceArgs, EditUse, ViewArgs};
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
@@ -25,13 +25,14 @@ const POLL_INTERVAL: Duration = Duration::from_millis(100);
 const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 
 pub fn view(args: &ViewArgs) -> Result<()> {
-    let ViewArgs { scene, port, device } = args;
-    Shown::open(scene, *port, device, &[])?.serve(device.json)
+    let ViewArgs { scene, port, edits, device } = args;
+    Shown::open((scene, *edits), *port, device, &[])?.serve(device.json)
 }
 
 /// A scene that is prepared to be served.
 pub struct Shown<'a> {
     path: &'a Path,
+    edits: EditUse,
     device: &'a DeviceArgs,
     /// Queries that the page offers.
     suggested: &'a [String],
@@ -54,12 +55,17 @@ impl<'a> Shown<'a> {
     ///
     /// # Errors
     /// A port that is in use, and a scene that cannot be read or has no splats.
-    pub fn open(path: &'a Path, port: u16, device: &'a DeviceArgs, suggested: &'a [String]) -> Result<Self> {
+    pub fn open(
+        (path, edits): (&'a Path, EditUse),
+        port: u16,
+        device: &'a DeviceArgs,
+        suggested: &'a [String],
+    ) -> Result<Self> {
         // The port is bound first: one that is in use is reported before the scene is prepared.
         let server = ServerAddress::bind(port)?;
         let before = written(path);
-        let prepared = Prepared::load(path, device, suggested)?;
-        Ok(Shown { path, device, suggested, server, before, prepared })
+        let prepared = Prepared::load((path, edits), device, suggested)?;
+        Ok(Shown { path, edits, device, suggested, server, before, prepared })
     }
 
     /// Address of the page.
@@ -69,7 +75,7 @@ impl<'a> Shown<'a> {
 
     /// Serves until the user or the parent process ends it.
     pub fn serve(self, as_json: bool) -> Result<()> {
-        let Shown { path, device, suggested, server, before, prepared } = self;
+        let Shown { path, edits, device, suggested, server, before, prepared } = self;
         let Prepared { site, mut ready, mut preview } = prepared;
         let options = Compat::answers(None, path)?;
         let (address, answers) = (server.url(), site.answers_questions);
@@ -105,7 +111,8 @@ impl<'a> Shown<'a> {
                 Some(stamp) if Some(stamp) == preview => {}
                 Some(stamp) => {
                     // A preview that is replaced at this moment comes with the next look.
-                    let packed = preview::of_running(path).map(|p| scene::load(&p).and_then(|s| pack(&s)));
+                    let packed =
+                        preview::of_running(path).map(|p| scene::load(&p, edits).and_then(|s| pack(&s)));
                     if let Some(Ok(packed)) = packed {
                         live.renew(packed);
                         preview = Some(stamp);
@@ -113,7 +120,7 @@ impl<'a> Shown<'a> {
                 }
                 // The run is over; without a new scene the preview stays.
                 None if written(path).is_some_and(|time| Some(time) != before) => {
-                    let last = Prepared::load(path, device, suggested)?;
+                    let last = Prepared::load((path, edits), device, suggested)?;
                     live.replace(last.site);
                     (ready, preview) = (last.ready, last.preview);
                 }
@@ -135,12 +142,12 @@ fn written(scene: &Path) -> Option<SystemTime> {
 }
 
 impl Prepared {
-    fn load(path: &Path, device: &DeviceArgs, suggested: &[String]) -> Result<Prepared> {
+    fn load((path, edits): (&Path, EditUse), device: &DeviceArgs, suggested: &[String]) -> Result<Prepared> {
         let preview = stamp(path);
         // The run may end at this moment and take its preview away.
-        let running = preview.and_then(|_| scene::load(&preview::of_running(path)?).ok());
+        let running = preview.and_then(|_| scene::load(&preview::of_running(path)?, edits).ok());
         let preview = preview.filter(|_| running.is_some());
-        let scene = running.map_or_else(|| scene::load(path), Ok)?;
+        let scene = running.map_or_else(|| scene::load(path, edits), Ok)?;
         if scene.splats.is_empty() {
             return Err(Error::input(format!("{}: no splats to show", path.display())));
         }

@@ -2,7 +2,7 @@
 //! surface where its normal is known, colour from the photos
 //! (docs/internals/method.md#splats-from-points).
 use super::options::InitOptions;
-use crate::math::Random;
+use crate::math::{Nearest, Random};
 use crate::scene::{PointCloud, SH_C0, Splats};
 use crate::{Error, Result};
 use glam::{Quat, Vec3};
@@ -132,98 +132,15 @@ fn occupied(
 
 /// Root of the mean squared distance to the three nearest other points, per point.
 pub fn neighbour_distances(positions: &[Vec3]) -> Vec<f32> {
-    let tree = KdTree::new(positions);
+    let tree = Nearest::new(positions);
     (0..positions.len())
         .into_par_iter()
         .map(|i| {
-            let squares = tree.nearest(positions[i], i);
-            let found: Vec<f32> = squares.into_iter().filter(|d| d.is_finite()).collect();
+            let others = tree.of::<3>(positions[i], Some(i));
+            let found: Vec<f32> = others.into_iter().flatten().map(|(_, square)| square).collect();
             (found.iter().sum::<f32>() / found.len().max(1) as f32).sqrt()
         })
         .collect()
-}
-
-/// Balanced k-d tree over point indices: the median of each range splits it along its widest axis.
-struct KdTree<'a> {
-    positions: &'a [Vec3],
-    order: Vec<u32>,
-    axes: Vec<u8>,
-}
-
-impl<'a> KdTree<'a> {
-    fn new(positions: &'a [Vec3]) -> Self {
-        let mut order: Vec<u32> = (0..positions.len() as u32).collect();
-        let mut axes = vec![0; positions.len()];
-        Self::build(positions, &mut order, &mut axes);
-        KdTree { positions, order, axes }
-    }
-
-    fn build(positions: &[Vec3], order: &mut [u32], axes: &mut [u8]) {
-        if order.len() < 2 {
-            return;
-        }
-        let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        for &i in order.iter() {
-            low = low.min(positions[i as usize]);
-            high = high.max(positions[i as usize]);
-        }
-        let axis = (high - low).max_position();
-        let middle = order.len() / 2;
-        order.select_nth_unstable_by(middle, |&a, &b| {
-            positions[a as usize][axis].total_cmp(&positions[b as usize][axis])
-        });
-        axes[middle] = axis as u8;
-        let (left, right) = order.split_at_mut(middle);
-        let (left_axes, right_axes) = axes.split_at_mut(middle);
-        // A parallel task for fewer points costs more than it saves.
-        if left.len() > 4096 {
-            rayon::join(
-                || Self::build(positions, left, left_axes),
-                || Self::build(positions, &mut right[1..], &mut right_axes[1..]),
-            );
-        } else {
-            Self::build(positions, left, left_axes);
-            Self::build(positions, &mut right[1..], &mut right_axes[1..]);
-        }
-    }
-
-    /// Squared distances to the three nearest points other than `skip`; infinite for missing ones.
-    fn nearest(&self, query: Vec3, skip: usize) -> [f32; 3] {
-        let mut best = [f32::INFINITY; 3];
-        self.search(query, skip as u32, 0, self.order.len(), &mut best);
-        best
-    }
-
-    fn search(&self, query: Vec3, skip: u32, from: usize, to: usize, best: &mut [f32; 3]) {
-        if from >= to {
-            return;
-        }
-        let middle = from + (to - from) / 2;
-        let index = self.order[middle];
-        let point = self.positions[index as usize];
-        if index != skip {
-            let mut d = point.distance_squared(query);
-            for slot in best.iter_mut() {
-                if d < *slot {
-                    std::mem::swap(&mut d, slot);
-                }
-            }
-        }
-        if to - from == 1 {
-            return;
-        }
-        let axis = self.axes[middle] as usize;
-        let offset = query[axis] - point[axis];
-        let (near, far) = if offset < 0.0 {
-            ((from, middle), (middle + 1, to))
-        } else {
-            ((middle + 1, to), (from, middle))
-        };
-        self.search(query, skip, near.0, near.1, best);
-        if offset * offset < best[2] {
-            self.search(query, skip, far.0, far.1, best);
-        }
-    }
 }
 
 #[cfg(test)]

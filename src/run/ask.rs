@@ -12,7 +12,7 @@ use crate::query::phrasing::{self, Reading, Vocabulary};
 use crate::query::presence::{Alternatives, ShownPixels};
 use crate::query::{self, CANONICAL_PHRASES, QueryOptions, TextQuery};
 use crate::report::viewer::CodeNames;
-use crate::scene::{Camera, LanguageField, Splats};
+use crate::scene::{Camera, Image, LanguageField, Splats};
 use crate::{Error, Result};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -248,6 +248,11 @@ impl QueryScene {
     /// Device milliseconds of the passes that search the frames; none where the processor does.
     pub fn time_passes(&self) -> Result<BTreeMap<String, f64>> {
         self.search.as_ref().map_or_else(|| Ok(BTreeMap::new()), DeviceSearch::time_passes)
+    }
+
+    /// Codes of one camera, as [`DecodedFrame::codes`].
+    pub fn codes(&mut self, camera: &Camera) -> Result<Vec<Image<i32>>> {
+        self.viewer.codes(camera)
     }
 
     /// Answers a text in every frame.

@@ -57,11 +57,12 @@ pub struct BaseScene {
 }
 
 impl BaseScene {
-    /// Reads a scene directory that `splatvk run` wrote.
+    /// Reads a scene directory that `splatvk run` wrote, without its edits: the new photos may show
+    /// more of deleted things.
     pub fn open(path: &Path) -> Result<BaseScene> {
         let record = record_of(path)?;
         let photos = scene_photos::load(path)?;
-        let scene = scene_dir::load(path)?;
+        let scene = scene_dir::load_unedited(path)?;
         let field = scene.language.ok_or_else(|| {
             Error::input(format!("{}: the scene has no language; make it with splatvk run", path.display()))
         })?;

@@ -276,6 +276,7 @@ pub(super) fn write(workspace: Workspace, outcome: &RunOutcome, progress: &dyn P
         splats: &outcome.splats,
         seen: &outcome.seen,
         backdrop: &outcome.backdrop,
+        holes: &Default::default(),
         cameras: &outcome.cameras,
         world: &outcome.world,
         photos: &outcome.photos,

@@ -67,10 +67,15 @@ enum SceneOrigin {
 }
 
 impl LiveScene {
-    /// Loads a scene directory, or a file of Gaussians without language; the text encoder comes
+    /// Loads a scene directory with its edits, or a file of Gaussians without language; the text encoder comes
     /// from `registry`.
     pub fn load(device: &Device, path: &Path, registry: &Registry) -> Result<LiveScene> {
-        LiveScene::new(device, SceneOrigin::Loaded(Box::new(scene_dir::load(path)?)), registry)
+        LiveScene::loaded(device, scene_dir::load(path)?, registry)
+    }
+
+    /// Takes a scene that was loaded.
+    pub fn loaded(device: &Device, scene: Scene, registry: &Registry) -> Result<LiveScene> {
+        LiveScene::new(device, SceneOrigin::Loaded(Box::new(scene)), registry)
     }
 
     /// Takes the outcome of a run.
@@ -345,6 +350,7 @@ fn save_loaded(scene: &Scene, path: &Path, replace: bool) -> Result<()> {
         splats: &scene.splats,
         seen: &scene.seen,
         backdrop: &scene.backdrop,
+        holes: &scene.holes,
         cameras: &scene.cameras,
         world: &scene.world,
         photos: &photos,

@@ -340,6 +340,7 @@ mod tests {
                 splats: &trained.splats,
                 seen: &Seen::default(),
                 backdrop: &Splats::default(),
+                holes: &Splats::default(),
                 cameras: std::slice::from_ref(&camera),
                 world: &World::default(),
                 photos: &[],

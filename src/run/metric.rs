@@ -68,15 +68,59 @@ impl FromStr for Length {
 }
 
 fn metres(text: &str) -> Result<f64, String> {
-    let text = text.trim();
-    let units = [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)];
-    let (number, unit) =
-        units.iter().find_map(|(name, unit)| Some((text.strip_suffix(name)?, *unit))).unwrap_or((text, 1.0));
-    let metres = number.trim().parse::<f64>().ok().map(|v| v * unit);
-    let metres = metres.filter(|v| v.is_finite() && *v > 0.0);
-    metres.ok_or_else(|| {
+    let distance = text.parse().ok().filter(Distance::is_positive);
+    let (Distance::Metres(metres) | Distance::Units(metres)) = distance.ok_or_else(|| {
         format!("\"{text}\": a length is a positive number of metres, or one with m, cm or mm")
-    })
+    })?;
+    Ok(metres)
+}
+
+/// A distance: metres with m, cm or mm, otherwise units of the scene.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Distance {
+    /// Metres.
+    Metres(f64),
+    /// Scene units.
+    Units(f64),
+}
+
+impl FromStr for Distance {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Distance, String> {
+        let text = text.trim();
+        let metres = [("mm", 1e-3), ("cm", 1e-2), ("m", 1.0)];
+        let found = metres.iter().find_map(|(name, unit)| Some((text.strip_suffix(name)?, *unit)));
+        let number = found.map_or(text, |(number, _)| number).trim().parse::<f64>().ok();
+        let number = number.filter(|v| v.is_finite()).ok_or_else(|| {
+            format!("\"{text}\": give a distance such as 2mm, 10cm, or 0.01 in the units of the scene")
+        })?;
+        Ok(found.map_or(Distance::Units(number), |(_, unit)| Distance::Metres(number * unit)))
+    }
+}
+
+impl Distance {
+    /// Whether it is above zero.
+    pub fn is_positive(&self) -> bool {
+        let (Distance::Metres(number) | Distance::Units(number)) = self;
+        *number > 0.0
+    }
+
+    /// Scene units.
+    ///
+    /// # Errors
+    /// Metres where the scale is not known.
+    pub fn in_units(self, scene: &Scene) -> Result<f64> {
+        match (self, &scene.world.scale) {
+            (Distance::Units(units), _) => Ok(units),
+            (Distance::Metres(metres), Some(scale)) => Ok(metres / scale.metres_per_unit),
+            (Distance::Metres(metres), None) => Err(Error::input(format!(
+                "{}: its scale is not known, so {metres} m cannot be used; state a length with splatvk measure --scale, \
+                 or give a number in the units of the scene",
+                scene.path.display()
+            ))),
+        }
+    }
 }
 
 /// σ of a clicked position, pixels.
@@ -187,6 +231,18 @@ pub fn scale(lengths: &[Length], measured: &[Measured]) -> Option<Scale> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn distances_have_units_or_are_the_scenes() {
+        assert_eq!("2mm".parse(), Ok(Distance::Metres(0.002)));
+        assert_eq!(" -0.5 cm".parse(), Ok(Distance::Metres(-0.005)));
+        assert_eq!("0.01".parse(), Ok(Distance::Units(0.01)));
+        for text in ["", "mm", "inf", "2 inches"] {
+            assert!(text.parse::<Distance>().is_err(), "{text}");
+        }
+        let error = Distance::Metres(0.002).in_units(&Scene::default()).unwrap_err();
+        assert!(error.exit_code() == 2 && error.to_string().contains("splatvk measure --scale"));
+    }
 
     #[test]
     fn lengths_parse_all_notations() {

@@ -7,6 +7,7 @@ pub mod budget;
 pub mod compat;
 pub mod concepts;
 pub mod config;
+pub mod edit;
 pub mod encoder;
 mod execute;
 mod fidelity;

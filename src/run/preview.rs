@@ -71,6 +71,7 @@ impl Preview {
             splats,
             seen: &Seen::default(),
             backdrop: &Default::default(),
+            holes: &Default::default(),
             cameras,
             world: &World::default(),
             photos: &placed.photos,

@@ -48,6 +48,8 @@ pub struct Viewer {
     models: Vec<Model>,
     /// Splats behind the scene.
     backdrop: Option<Renderer>,
+    /// Splats that edits took away.
+    holes: Option<Renderer>,
     /// Number of levels of the field.
     levels: usize,
     /// Decoded codes at the size of the last view.
@@ -155,7 +157,14 @@ impl Viewer {
             let carrier = field.levels[level].carrier(splats);
             models.push(Model::new(device, carrier, field, &[level], &shown)?);
         }
-        Ok(Viewer { device: device.clone(), models, backdrop: None, levels: shown.len(), output: None })
+        Ok(Viewer {
+            device: device.clone(),
+            models,
+            backdrop: None,
+            holes: None,
+            levels: shown.len(),
+            output: None,
+        })
     }
 
     /// Draws the splats of a backdrop behind the scene in [`DecodedFrame::picture`]; depth, opacity
@@ -163,6 +172,15 @@ impl Viewer {
     pub fn with_backdrop(mut self, backdrop: &Splats) -> Result<Self> {
         if !backdrop.is_empty() {
             self.backdrop = Some(Renderer::new(&self.device, backdrop, &[], 0)?);
+        }
+        Ok(self)
+    }
+
+    /// Hatches [`DecodedFrame::picture`] where the scene shows nothing in front of these splats, which
+    /// edits took away.
+    pub fn with_holes(mut self, holes: &Splats) -> Result<Self> {
+        if !holes.is_empty() {
+            self.holes = Some(Renderer::new(&self.device, holes, &[], 0)?);
         }
         Ok(self)
     }
@@ -212,10 +230,15 @@ impl Viewer {
         let (w, h) = (camera.width as usize, camera.height as usize);
         let mut rendered = RenderedFrame::empty(w, h, if features { width } else { 0 });
         let codes = self.decode_view(camera, Some(&mut rendered))?;
-        let filled = match &mut self.backdrop {
-            Some(renderer) => Some(over(&rendered, &renderer.render(camera)?.rgb)),
-            None => None,
+        let behind = self.backdrop.as_mut().map(|backdrop| backdrop.render(camera)).transpose()?;
+        let behind = match &mut self.holes {
+            Some(holes) => {
+                let holes = hatched(holes.render(camera)?);
+                Some(behind.map_or_else(|| holes.rgb.clone(), |behind| over(&holes, &behind.rgb)))
+            }
+            None => behind.map(|behind| behind.rgb),
         };
+        let filled = behind.map(|behind| over(&rendered, &behind));
         DecodedFrame::new(rendered, codes, filled)
     }
 
@@ -259,6 +282,21 @@ impl Viewer {
         }
         Ok(codes)
     }
+}
+
+/// Brightness of the two stripes of a hatched area.
+const HATCHING: [f32; 2] = [0.35, 0.65];
+/// Width of a stripe along the rows, pixels.
+const STRIPE: usize = 6;
+
+/// The frame of holes as stripes of its opacity.
+fn hatched(mut holes: RenderedFrame) -> RenderedFrame {
+    let width = holes.rgb.width;
+    for (i, (colour, alpha)) in holes.rgb.data.iter_mut().zip(&holes.alpha.data).enumerate() {
+        let stripe = (i % width + i / width) / STRIPE % 2;
+        *colour = [HATCHING[stripe] * alpha; 3];
+    }
+    holes
 }
 
 /// Colours of a frame over those behind it.

@@ -1,6 +1,7 @@
 """The checks of tools/formats/check: every format through a reader or writer that is not ours, JSON against its schemas."""
 import json
 import os
+import shutil
 import struct
 import subprocess
 import sys
@@ -482,6 +483,10 @@ def json_formats():
     hold("eval", json.loads((WORK / "eval/eval.json").read_text()), "eval.json")
     events |= said("measure", "measure", SCENE, "0,0,1 - 1,0,1", "--json")
     events |= said("objects", "objects", SCENE, "--json")
+    edited = WORK / "edited"
+    shutil.copytree(SCENE, edited)
+    run("edit", edited, "--delete", "opacity<0.2", "--recolour", "seen>1=#36f")
+    hold("edits", json.loads((edited / "edits.json").read_text()), "edits.json")
     events |= said("models-list", "models", "list", "--json")
     events |= said("doctor", "doctor", "--json")
     said(None, "bench", "--splats", 500, "--width", 64, "--height", 48, "--features", 0, "--repeats", 1, "--json",

@@ -3,6 +3,7 @@ use super::args::AskArgs;
 use crate::protocol::{Asked, Clicked, Counts, Kind, Named, Photographs};
 use crate::{Error, Result};
 use serde_json::json;
+use splatvk::cli::args::EditUse;
 use splatvk::cli::print::{print, print_json};
 use splatvk::cli::{progress, scene};
 use splatvk::gpu;
@@ -13,7 +14,7 @@ use splatvk::run::encoder;
 use std::fmt::Write;
 
 pub fn ask(args: &AskArgs) -> Result<()> {
-    let mut scene = scene::load(&args.scene)?;
+    let mut scene = scene::load(&args.scene, EditUse::default())?;
     let photographs = Photographs::open(&args.labels, &scene.cameras)?;
     let encoder = encoder::of_scene(&scene, args.device.registry()?)?;
     let field = scene.language.take().ok_or_else(|| {

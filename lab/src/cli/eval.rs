@@ -2,6 +2,7 @@
 use super::args::EvalArgs;
 use crate::protocol::{self, CodeScores, DecodedView, Masks, ProtocolKind};
 use crate::{Error, Result};
+use splatvk::cli::args::EditUse;
 use splatvk::cli::eval::{embed, report};
 use splatvk::cli::outputs::WrittenFiles;
 use splatvk::cli::{progress, scene, views};
@@ -18,7 +19,7 @@ pub fn eval(args: &EvalArgs) -> Result<()> {
     let inputs: Vec<&Path> = inputs.into_iter().flatten().map(PathBuf::as_path).collect();
     let open = |out| WrittenFiles::open(out, args.force, &inputs);
     let mut out = args.out.as_deref().map(open).transpose()?;
-    let scene = scene::load(&args.scene)?;
+    let scene = scene::load(&args.scene, EditUse::default())?;
     let scores = published(args.protocol.kind(), &scene, args, out.as_mut())?;
     report(&scores, out, None, args.device.json)
 }

@@ -2,6 +2,7 @@
 use super::args::MeshAccuracyArgs;
 use crate::{Error, Result};
 use serde_json::{Value, json};
+use splatvk::cli::args::EditUse;
 use splatvk::cli::print::{print, print_json};
 use splatvk::cli::{progress, scene};
 use splatvk::eval::{GroundTruth, Split};
@@ -16,7 +17,7 @@ pub fn mesh_accuracy(args: &MeshAccuracyArgs) -> Result<()> {
     let truth = GroundTruth::read(&args.ground_truth)?;
     let photos = views(&truth, |split| split == Split::Train)?;
     let others = views(&truth, |split| split != Split::Train)?;
-    let scene = scene::load(&args.scene)?;
+    let scene = scene::load(&args.scene, EditUse::default())?;
     let to_truth = similarity(&truth, &scene)?;
     let options = MeshOptions {
         voxel: args.voxel,

@@ -58,6 +58,14 @@ impl SavingArgs {
     }
 }
 
+/// Use of a scene's edits.
+#[derive(Clone, Copy, Debug, Default, Args)]
+pub struct EditUse {
+    /// Take the scene as it was reconstructed, without the edits of splatvk edit
+    #[arg(long)]
+    pub ignore_edits: bool,
+}
+
 /// Options that every command working on a device takes.
 #[derive(Clone, Debug, Default, Args)]
 pub struct DeviceArgs {

@@ -12,8 +12,8 @@ use super::plan::RunPlan;
 use super::remaining::WithRemaining;
 use super::sources;
 use super::stages::GivenViews;
-use crate::format::Workspace;
 use crate::format::scene_dir::{self, Scene};
+use crate::format::{Workspace, edits};
 use crate::pass::renderer::{RenderedFrame, Renderer};
 use crate::photo::{self, Photo};
 use crate::pose::Geometry;
@@ -129,6 +129,11 @@ fn add_points(points: &mut PointCloud, view: usize, camera: &Camera, depth: &Dep
 
 /// Checksum of the splats.
 fn identity(path: &Path) -> Result<String> {
-    let file = if path.is_dir() { path.join("point_cloud.ply") } else { path.to_path_buf() };
-    files::content_hash(&file).map_err(Error::io(&file))
+    let sum = |file: &Path| files::content_hash(file).map_err(Error::io(file));
+    if !path.is_dir() {
+        return sum(path);
+    }
+    let edits = path.join(edits::FILE);
+    let edits = if edits.exists() { sum(&edits)? } else { String::new() };
+    Ok(sum(&path.join("point_cloud.ply"))? + " " + &edits)
 }

@@ -4,6 +4,7 @@ mod camera_file;
 pub mod cameras;
 pub mod colmap;
 mod common;
+pub mod edits;
 pub mod gaussians;
 mod glb;
 mod lens_models;

@@ -1,4 +1,5 @@
 //! The scene directory: written by a run and read by every other command.
+use super::edits::{AppliedEdits, EditList};
 use super::npy::{self, NpyArray};
 use super::{
     cameras, colmap, create_folder, gaussians, level_arrays, picture, ply, scene_photos, transforms,
@@ -33,6 +34,9 @@ pub(super) const SEEN: &str = "seen.npy";
 /// Splats behind the scene, which are no part of it: blurred colours of the surroundings.
 pub(super) const BACKDROP: &str = "backdrop.ply";
 
+/// Splats that edits took away.
+pub(super) const HOLES: &str = "holes.ply";
+
 /// A loaded scene.
 #[derive(Clone, Debug, Default)]
 #[non_exhaustive]
@@ -45,12 +49,17 @@ pub struct Scene {
     pub seen: Seen,
     /// Splats behind the scene, which no photo shows; empty for a bare PLY.
     pub backdrop: Splats,
+    /// Splats that edits took away from where they were, of SH degree 0: nothing is known of the
+    /// space behind them, and pictures are hatched where it shows.
+    pub holes: Splats,
     /// Training cameras at working resolution; empty for a bare PLY.
     pub cameras: Vec<Camera>,
     /// Direction up and scale, where known.
     pub world: World,
     /// Codebooks and features; `None` without language.
     pub language: Option<LanguageField>,
+    /// The edits that it contains; `None` for a reconstruction as it is.
+    pub edits: Option<AppliedEdits>,
     /// Notes for the user on parts of a file of Gaussians that were left out; a scene directory is
     /// read completely or refused.
     pub warnings: Vec<String>,
@@ -102,6 +111,8 @@ pub struct Contents<'a> {
     pub seen: &'a Seen,
     /// Splats behind the scene; may be empty.
     pub backdrop: &'a Splats,
+    /// Splats that edits took away; may be empty.
+    pub holes: &'a Splats,
     /// One per photo, at working resolution.
     pub cameras: &'a [Camera],
     /// Direction up and scale of the scene.
@@ -124,10 +135,10 @@ pub fn write(folder: &Path, c: &Contents) -> Result<()> {
     if !c.seen.pixels.is_empty() {
         npy::write(folder.join(SEEN), &NpyArray::f32(&[c.seen.pixels.len()], c.seen.pixels.clone()))?;
     }
-    if !c.backdrop.is_empty() {
+    for (name, splats) in [(BACKDROP, c.backdrop), (HOLES, c.holes)].iter().filter(|(_, s)| !s.is_empty()) {
         // In its own degree: it is drawn behind the scene, not opened alone.
-        let options = ply::PlyOptions { degree: c.backdrop.sh_degree, ..ply::PlyOptions::default() };
-        ply::write_splats(&folder.join(BACKDROP), c.backdrop, options)?;
+        let options = ply::PlyOptions { degree: splats.sh_degree, ..ply::PlyOptions::default() };
+        ply::write_splats(&folder.join(name), splats, options)?;
     }
     let camera_folder = folder.join("cameras");
     create_folder(&camera_folder)?;
@@ -233,8 +244,18 @@ pub fn write_world(path: &Path, world: &World) -> Result<()> {
     super::write_whole_file(&path.join(MANIFEST), |file| super::write_json(file, &manifest))
 }
 
-/// Loads a scene directory, or a file of Gaussians ([`gaussians::read`]), which has no cameras.
+/// Loads a scene directory with its edits, or a file of Gaussians ([`gaussians::read`]), which has no
+/// cameras.
 pub fn load(path: &Path) -> Result<Scene> {
+    let scene = load_unedited(path)?;
+    match path.is_dir() {
+        true => EditList::read(path, &scene.splats).map(|list| list.apply(scene)),
+        false => Ok(scene),
+    }
+}
+
+/// Loads a scene like [`load`], as it was reconstructed.
+pub fn load_unedited(path: &Path) -> Result<Scene> {
     if path.is_file() {
         let (splats, language, warnings) = gaussians::read_noted(path)?;
         return Ok(Scene { path: path.into(), splats, language, warnings, ..Scene::default() });
@@ -254,11 +275,16 @@ pub fn load(path: &Path) -> Result<Scene> {
     let splats = cut_degree(splats, manifest.sh_degree);
     let language = manifest.language.map(|m| read_language(path, &m, splats.len())).transpose()?;
     let seen = read_seen(path, splats.len())?;
-    // Scenes of earlier versions lack the file.
-    let backdrop = path.join(BACKDROP);
-    let backdrop = if is_missing(&backdrop) { Splats::default() } else { read_own(&backdrop)? };
+    let [backdrop, holes] =
+        [BACKDROP, HOLES].map(|name| path.join(name)).map(|file| match is_missing(&file) {
+            true => Ok(Splats::default()),
+            false => read_own(&file),
+        });
+    let (backdrop, holes) = (backdrop?, holes?);
     let world = manifest.world;
-    Ok(Scene { path: path.into(), splats, seen, backdrop, cameras, world, language, warnings: Vec::new() })
+    let path = path.into();
+    let (edits, warnings) = (None, Vec::new());
+    Ok(Scene { path, splats, seen, backdrop, holes, cameras, world, language, edits, warnings })
 }
 
 /// Reads Gaussians of this program: all of them or none.
@@ -269,7 +295,7 @@ fn read_own(path: &Path) -> Result<Splats> {
 }
 
 /// A folder or a pipe in the place of a file does not count as missing.
-fn is_missing(file: &Path) -> bool {
+pub(super) fn is_missing(file: &Path) -> bool {
     file.symlink_metadata().is_err_and(|e| e.kind() == std::io::ErrorKind::NotFound)
 }
 

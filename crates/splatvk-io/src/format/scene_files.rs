@@ -46,11 +46,12 @@ impl Names {
             "language",
             "previews",
         ];
-        const FILES: [&str; 11] = [
+        const FILES: [&str; 12] = [
             scene_dir::MANIFEST,
             scene_dir::SPLATS,
             scene_dir::SEEN,
             scene_dir::BACKDROP,
+            scene_dir::HOLES,
             "run.json",
             "report.html",
             "cameras/transforms.json",

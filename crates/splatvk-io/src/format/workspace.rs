@@ -99,7 +99,7 @@ impl Replaced {
             Some(foreign) if !foreign.is_empty() => {
                 files::check_free_inside(out)?;
                 Err(Error::input(format!(
-                    "{place}: holds {name}, and with it what splatvk did not write: {}; move that elsewhere, or choose another --out",
+                    "{place}: holds {name}, and with it files that no run wrote: {}; move them elsewhere, or choose another --out",
                     files::listed(&foreign)
                 )))
             }
@@ -140,6 +140,7 @@ mod tests {
             splats: &splats,
             seen: &crate::scene::Seen::default(),
             backdrop: &splats,
+            holes: &splats,
             cameras: std::slice::from_ref(&camera),
             world: &Default::default(),
             photos: &[],

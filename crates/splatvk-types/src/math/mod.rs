@@ -1,8 +1,10 @@
 //! Arithmetic that several folders share; depends on no other module of the crate.
+mod nearest;
 mod random;
 mod sphere;
 mod statistics;
 
+pub use nearest::Nearest;
 pub use random::{Random, hash};
 pub use sphere::sphere_directions;
 pub use statistics::{median, quantile};

@@ -1,0 +1,213 @@
+//! Edits of a scene directory: selects splats, and keeps a list of operations on them
+//! (docs/use/edit.md).
+mod complete;
+pub mod expression;
+mod floaters;
+mod select;
+
+use super::ask::QueryScene;
+use super::encoder;
+use super::plan::Machine;
+use crate::format::edits::{Edit, EditList, Operation, Rows, Term};
+use crate::format::scene_dir::{self, Scene};
+use crate::pass::renderer::Renderer;
+use crate::query::clicks::Standing;
+use crate::query::instances::Places;
+use crate::scene::{Camera, Image, LanguageField};
+use crate::{Error, Result, gpu};
+use std::path::Path;
+
+/// Selected splats.
+#[derive(Clone, Debug, Default)]
+pub struct Selected {
+    /// Rows in the reconstruction.
+    pub rows: Rows,
+    /// Number of splats.
+    pub count: usize,
+    /// Share of the opacity of the scene, 0 to 1.
+    pub share: f64,
+    /// Reasons why the selection may be wrong, each a clause; none where it is sure.
+    pub doubts: Vec<String>,
+    /// How they were selected.
+    pub terms: Vec<Term>,
+}
+
+/// A scene directory that is being edited.
+///
+/// ```no_run
+/// # fn main() -> splatvk::Result<()> {
+/// use splatvk::format::edits::Operation;
+/// use splatvk::run::{Machine, edit::{Editor, expression}};
+/// let mut editor = Editor::open("kitchen".as_ref(), &Machine::default())?;
+/// let chair = editor.select(&expression::terms("chair", editor.scene(), 0.0)?)?;
+/// if chair.doubts.is_empty() {
+///     editor.push(vec![(Operation::Delete {}, chair)])?;
+/// }
+/// # Ok(())
+/// # }
+/// ```
+pub struct Editor {
+    machine: Machine,
+    /// The scene as it was reconstructed.
+    whole: Scene,
+    list: EditList,
+    /// The scene after its edits.
+    scene: Scene,
+    /// State of selections, made by the first one that needs it.
+    lookup: Lookup,
+}
+
+/// Data of the edited scene for selections.
+#[derive(Default)]
+struct Lookup {
+    /// Words and codes, on the device.
+    words: Option<QueryScene>,
+    /// Depth of the splats, on the device.
+    surface: Option<Renderer>,
+    standing: Option<Standing>,
+    /// Places of a scene without language.
+    places: Option<Places>,
+}
+
+impl Editor {
+    /// Loads a scene directory.
+    ///
+    /// # Errors
+    /// A file of Gaussians, and an edit list that cannot be read.
+    pub fn open(path: &Path, machine: &Machine) -> Result<Editor> {
+        if path.is_file() {
+            return Err(Error::input(format!(
+                "{}: a file of Gaussians has no place for edits; splatvk label makes a scene directory of it",
+                path.display()
+            )));
+        }
+        let whole = scene_dir::load_unedited(path)?;
+        let list = EditList::read(path, &whole.splats)?;
+        let scene = list.apply(whole.clone());
+        Ok(Editor { machine: machine.clone(), whole, list, scene, lookup: Lookup::default() })
+    }
+
+    /// The scene after its edits.
+    pub fn scene(&self) -> &Scene {
+        &self.scene
+    }
+
+    /// The edits.
+    pub fn list(&self) -> &EditList {
+        &self.list
+    }
+
+    /// Selects splats of the edited scene.
+    ///
+    /// # Errors
+    /// A word that the scene does not contain or the text model does not know, an id or a property
+    /// that the scene does not have, and a selection of nothing.
+    pub fn select(&mut self, terms: &[Term]) -> Result<Selected> {
+        let (rows, doubts) = self.rows(terms)?;
+        if rows.is_empty() {
+            return Err(Error::input(format!("{}: selects no splat of the scene", expression::texts(terms))));
+        }
+        let opacity = |i: usize| 1.0 / (1.0 + f64::from(-self.scene.splats.opacity_logits[i]).exp());
+        let all: f64 = (0..self.scene.splats.len()).map(opacity).sum();
+        let share = rows.iter().map(|i| opacity(*i)).sum::<f64>() / all.max(f64::MIN_POSITIVE);
+        let count = rows.len();
+        let rows = match &self.scene.edits {
+            Some(edits) => edits.originals(rows),
+            None => Rows::of(rows),
+        };
+        Ok(Selected { rows, count, share, doubts, terms: terms.to_vec() })
+    }
+
+    /// Adds edits of selections, and writes the list into the scene.
+    ///
+    /// # Errors
+    /// Edits that leave nothing, a folder that cannot be written, and a list that another program
+    /// changed meanwhile; the scene is unchanged then.
+    pub fn push(&mut self, edits: Vec<(Operation, Selected)>) -> Result<()> {
+        let mut list = self.list.clone();
+        for (operation, Selected { terms, rows, .. }) in edits {
+            list.push(Edit { operation, selection: terms, splats: rows });
+        }
+        let scene = list.apply(self.whole.clone());
+        if scene.splats.is_empty() {
+            return Err(Error::input(format!(
+                "{}: the edit leaves no splat; nothing is changed",
+                self.whole.path.display()
+            )));
+        }
+        self.replace(list, scene)
+    }
+
+    /// Undoes the last edit; false without one.
+    ///
+    /// # Errors
+    /// A folder that cannot be written.
+    pub fn undo(&mut self) -> Result<bool> {
+        self.step(EditList::undo)
+    }
+
+    /// Applies the edit that was undone last; false without one.
+    ///
+    /// # Errors
+    /// A folder that cannot be written.
+    pub fn redo(&mut self) -> Result<bool> {
+        self.step(EditList::redo)
+    }
+
+    fn step(&mut self, step: impl FnOnce(&mut EditList) -> bool) -> Result<bool> {
+        let mut list = self.list.clone();
+        if !step(&mut list) {
+            return Ok(false);
+        }
+        let scene = list.apply(self.whole.clone());
+        self.replace(list, scene).map(|()| true)
+    }
+
+    fn replace(&mut self, list: EditList, scene: Scene) -> Result<()> {
+        list.replace(&self.list, &self.whole)?;
+        (self.list, self.scene, self.lookup) = (list, scene, Lookup::default());
+        Ok(())
+    }
+
+    /// The scene with its words on the device.
+    fn words(&mut self) -> Result<&mut QueryScene> {
+        if self.lookup.words.is_none() {
+            let scene = &self.scene;
+            let field = scene.language.clone().ok_or_else(|| {
+                Error::input(format!(
+                    "{}: the scene has no language, so no words, ids and clicks; splatvk label gives it one",
+                    scene.path.display()
+                ))
+            })?;
+            let encoder = encoder::of_scene(scene, self.machine.registry()?)?;
+            let device = gpu::open(self.machine.device.as_deref())?;
+            let ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
+            self.lookup.words = Some(ready);
+        }
+        self.lookup.words.as_mut().ok_or_else(|| Error::work("no words"))
+    }
+
+    /// Depth of a view, scene units; 0 where nothing is.
+    fn depth(&mut self, camera: &Camera) -> Result<Image<f32>> {
+        if self.lookup.surface.is_none() {
+            let device = gpu::open(self.machine.device.as_deref())?;
+            self.lookup.surface = Some(Renderer::new(&device, &self.scene.splats.bare(), &[], 0)?);
+        }
+        let renderer = self.lookup.surface.as_mut().ok_or_else(|| Error::work("no renderer"))?;
+        Ok(renderer.render(camera)?.depth)
+    }
+
+    /// Positions of the splats, with their codes where the scene has language.
+    fn places(&mut self) -> &Places {
+        let Editor { scene, lookup, .. } = self;
+        match &lookup.words {
+            Some(words) => words.places(),
+            None => lookup.places.get_or_insert_with(|| {
+                Places::of(&scene.splats, scene.language.as_ref().unwrap_or(&LanguageField::default()))
+            }),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

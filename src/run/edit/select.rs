@@ -1,0 +1,228 @@
+//! Splats of the rules of a selection.
+use super::complete::completed;
+use super::{Editor, floaters};
+use crate::format::edits::{Combine, Pick, Property, Term};
+use crate::query::clicks::Standing;
+use crate::query::presence::Presence;
+use crate::query::{MaskRule, QueryOptions};
+use crate::run::Compat;
+use crate::scene::{Camera, LEVEL_NAMES, LanguageField};
+use crate::{Error, Result};
+use glam::DVec2;
+use rayon::prelude::*;
+
+/// Splats of a rule.
+#[derive(Default)]
+struct Found {
+    /// Rows of the edited scene, ascending.
+    rows: Vec<usize>,
+    doubts: Vec<String>,
+    /// Level whose codes selected them.
+    level: Option<usize>,
+}
+
+impl Editor {
+    /// Rows of the edited scene that terms select.
+    pub(super) fn rows(&mut self, terms: &[Term]) -> Result<(Vec<usize>, Vec<String>)> {
+        let mut selected = vec![false; self.scene.splats.len()];
+        let mut doubts = Vec::new();
+        for term in terms {
+            let Found { rows, doubts: more, level } = self.pick(&term.pick)?;
+            let rows = match level {
+                Some(level) => {
+                    let lists = &self.words()?.places().lists()[level].clone();
+                    completed(rows, &self.scene.splats, lists)
+                }
+                None => rows,
+            };
+            let mut is_picked = vec![false; selected.len()];
+            rows.iter().for_each(|row| is_picked[*row] = true);
+            for (selected, picked) in selected.iter_mut().zip(is_picked) {
+                *selected = match term.combine {
+                    Combine::Add => *selected | picked,
+                    Combine::Remove => *selected & !picked,
+                    Combine::Intersect => *selected & picked,
+                };
+            }
+            doubts.extend(more);
+        }
+        let rows = selected.iter().enumerate().filter(|(_, is)| **is).map(|(row, _)| row).collect();
+        Ok((rows, doubts))
+    }
+
+    fn pick(&mut self, pick: &Pick) -> Result<Found> {
+        let sure = |rows: Vec<usize>| Found { rows, ..Found::default() };
+        let of_level = |(rows, level): (Vec<usize>, usize)| Found { level: Some(level), ..sure(rows) };
+        match pick {
+            Pick::Word { text, grow } => self.word(text, *grow),
+            Pick::Thing { id } => self.thing(id).map(of_level),
+            Pick::Range { property, least, most } => self.range(*property, *least, *most).map(sure),
+            Pick::Click { camera, pixel, level } => self.click(camera, *pixel, *level).map(of_level),
+            Pick::Outline { camera, polygon, through } => self.outline(camera, polygon, *through).map(sure),
+            Pick::Floaters { thorough } => {
+                let cameras = self.scene.cameras.clone();
+                let depths = cameras.iter().map(|c| self.depth(c)).collect::<Result<Vec<_>>>()?;
+                Ok(sure(floaters::find(&self.scene, &depths, *thorough)?))
+            }
+        }
+    }
+
+    /// Splats of the answer to a text.
+    fn word(&mut self, text: &str, grow: f32) -> Result<Found> {
+        if !(-1.0..=1.0).contains(&grow) {
+            return Err(Error::input(format!("grow {grow}: give −1 to 1")));
+        }
+        let mut options = Compat::answers(None, &self.scene.path)?;
+        if grow != 0.0 {
+            let MaskRule::Codes(share) = options.mask else {
+                return Err(Error::input(
+                    "the answers of this scene follow a published protocol and cannot grow",
+                ));
+            };
+            options = QueryOptions { mask: MaskRule::Codes(grown(share, grow)), ..options };
+        }
+        let answers = self.words()?.ask(text, &options)?;
+        let refused = |reason: &str| {
+            Err(Error::input(format!(
+                "\"{text}\": {reason}; splatvk objects lists the things of the scene, and \"id:l3\" selects one"
+            )))
+        };
+        let mut found = Found { rows: answers.selection.splats, ..Found::default() };
+        found.level = Some(answers.selection.level);
+        match answers.presence {
+            _ if answers.reading.is_unknown() => refused("the built-in words do not know it"),
+            Some(Presence::Absent) => refused("there is no sign of it in the scene"),
+            _ if found.rows.is_empty() || !answers.selection.found => {
+                refused("it fits no splat of the scene")
+            }
+            Some(Presence::Found) => Ok(found),
+            Some(Presence::Unsure) | None => {
+                let doubt = match answers.p_value {
+                    Some(p) => {
+                        format!("is unsure ({:.0} % of other things fit the scene as well)", 100.0 * p)
+                    }
+                    None => "may be absent: the text model of this scene cannot judge it".to_owned(),
+                };
+                Ok(Found { doubts: vec![format!("\"{text}\" {doubt}")], ..found })
+            }
+        }
+    }
+
+    /// Splats of a thing of `splatvk objects`.
+    fn thing(&mut self, id: &str) -> Result<(Vec<usize>, usize)> {
+        let places = self.words()?.places();
+        let named = |level: usize, label: String| format!("{}{label}", LEVEL_NAMES[level]) == id;
+        let thing = places.things(0.0).into_iter().find(|thing| named(thing.level, thing.label()));
+        thing.map(|thing| (thing.instance.splats, thing.level)).ok_or_else(|| {
+            Error::input(format!("\"id:{id}\": the scene has no such thing; splatvk objects lists its ids"))
+        })
+    }
+
+    /// Splats whose property is in a range.
+    fn range(&self, property: Property, least: Option<f64>, most: Option<f64>) -> Result<Vec<usize>> {
+        let scene = &self.scene;
+        let value: Box<dyn Fn(usize) -> f64 + Sync> = match property {
+            Property::Opacity => Box::new(|i| 1.0 / (1.0 + f64::from(-scene.splats.opacity_logits[i]).exp())),
+            Property::Size => {
+                Box::new(|i| f64::from(scene.splats.log_scales[i].into_iter().fold(f32::MIN, f32::max)).exp())
+            }
+            Property::Seen if scene.seen.pixels.is_empty() => {
+                return Err(self.unknown("seen: the scene does not state the photos' weights of its splats"));
+            }
+            Property::Seen => Box::new(|i| f64::from(scene.seen.pixels[i])),
+            Property::Reliability => {
+                let levels = scene.language.iter().flat_map(|field| &field.levels).rev();
+                let known = levels.map(|level| &level.reliability).find(|values| !values.is_empty());
+                let values = known.ok_or_else(|| {
+                    self.unknown("reliability: the scene does not state it; scenes of splatvk run do")
+                })?;
+                Box::new(|i| f64::from(values[i]))
+            }
+        };
+        let inside = |i: &usize| {
+            let value = value(*i);
+            least.is_none_or(|least| value >= least) && most.is_none_or(|most| value <= most)
+        };
+        Ok((0..scene.splats.len()).into_par_iter().filter(inside).collect())
+    }
+
+    fn unknown(&self, reason: &str) -> Error {
+        Error::input(format!("{}: {reason}", self.scene.path.display()))
+    }
+
+    /// Splats of the code at a pixel.
+    fn click(
+        &mut self,
+        camera: &Camera,
+        pixel: [f64; 2],
+        level: Option<usize>,
+    ) -> Result<(Vec<usize>, usize)> {
+        let at = pixel_of(camera, pixel)?;
+        let maps = self.words()?.codes(camera)?;
+        let codes: Vec<Option<usize>> = maps.iter().map(|map| usize::try_from(map.data[at]).ok()).collect();
+        let Editor { scene, lookup, .. } = self;
+        let field = scene.language.as_ref();
+        let standing = lookup.standing.get_or_insert_with(|| {
+            Standing::of(&scene.splats, field.unwrap_or(&LanguageField::default()), &scene.cameras)
+        });
+        let level = level.or_else(|| standing.level_of(&codes));
+        let found = level.and_then(|level| Some((level, (*codes.get(level)?)?)));
+        let (level, code) = found.ok_or_else(|| {
+            let [x, y] = pixel;
+            Error::input(format!("{}: there is no thing at pixel {x:.0}, {y:.0}", camera.name))
+        })?;
+        Ok((self.places().lists()[level].splats_of(std::iter::once(code)), level))
+    }
+
+    /// Splats whose centres lie in an outline.
+    fn outline(&mut self, camera: &Camera, polygon: &[[f64; 2]], through: bool) -> Result<Vec<usize>> {
+        if polygon.len() < 3 || polygon.iter().flatten().any(|v| !v.is_finite()) {
+            return Err(Error::input("an outline has at least three corners, all of them finite"));
+        }
+        let all: Vec<usize> = (0..self.scene.splats.len()).collect();
+        let shown = match through {
+            true => all,
+            false => {
+                let depth = self.depth(camera)?;
+                self.places().visible(&all, camera, &depth).splats()
+            }
+        };
+        let means = &self.scene.splats.means;
+        let inside = |i: &usize| {
+            let (pixel, z) = camera.project(glam::DVec3::from_array(means[*i].map(f64::from)));
+            z > 0.0 && is_inside(polygon, pixel)
+        };
+        Ok(shown.into_par_iter().filter(inside).collect())
+    }
+}
+
+/// Share of a mask's bar ([`MaskRule::Codes`]) that grows or shrinks it.
+pub(super) fn grown(share: f32, grow: f32) -> f32 {
+    match grow >= 0.0 {
+        true => share * (1.0 - grow),
+        false => share + (1.0 - share) * -grow,
+    }
+}
+
+/// Index of a pixel of a view.
+fn pixel_of(camera: &Camera, [x, y]: [f64; 2]) -> Result<usize> {
+    let inside = |v: f64, size: u32| (0.0..f64::from(size)).contains(&v);
+    match inside(x, camera.width) && inside(y, camera.height) {
+        true => Ok(y as usize * camera.width as usize + x as usize),
+        false => Err(Error::input(format!("{}: pixel {x}, {y} is outside of the view", camera.name))),
+    }
+}
+
+/// Whether a point is inside a polygon (even-odd rule).
+pub(super) fn is_inside(polygon: &[[f64; 2]], p: DVec2) -> bool {
+    let mut inside = false;
+    let mut last = polygon[polygon.len() - 1];
+    for &corner in polygon {
+        let [[x, y], [px, py]] = [corner, last];
+        if (y > p.y) != (py > p.y) && p.x < (px - x) * (p.y - y) / (py - y) + x {
+            inside = !inside;
+        }
+        last = corner;
+    }
+    inside
+}
