@@ -12,7 +12,7 @@ use super::stages::{CameraOrigin, GivenViews, PlacedPhotos};
 use super::view::Viewer;
 use super::{label, photos, points, summary};
 use crate::format::scene_dir::{self, Contents};
-use crate::format::{Workspace, cameras};
+use crate::format::{Workspace, cameras, edits};
 use crate::gpu::Device;
 use crate::infer::{Registry, home};
 use crate::photo::{self, Photo};
@@ -33,6 +33,9 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
     let progress = &Recorded::new(&remaining);
     plan.inputs.check()?;
     let base = plan.inputs.add.as_deref().map(BaseScene::open).transpose()?.map(Arc::new);
+    if let Some(scene) = plan.inputs.add.as_ref().filter(|scene| scene.join(edits::FILE).exists()) {
+        progress.warn(&format!("{}: its edits stay there, the new scene has none", scene.display()));
+    }
     let registry = plan.machine.registry()?;
     if let Some(language) = &plan.config.language {
         sources::check_texts(&language.features, &plan.inputs.queries, &registry)?;

@@ -251,6 +251,7 @@ fn scene_files() -> Vec<(String, Vec<u8>)> {
         splats: &s,
         seen: &Seen { pixels: vec![3.0; 6] },
         backdrop: &Default::default(),
+        holes: &Splats::default(),
         cameras: &[named("a.png"), named("b.png")],
         world: &World::default(),
         photos: &photos,

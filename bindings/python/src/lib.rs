@@ -4,6 +4,7 @@ mod answer;
 mod arrays;
 mod camera;
 mod device;
+mod edit;
 mod errors;
 mod scene;
 mod work;
@@ -18,6 +19,8 @@ mod _splatvk {
     use crate::camera::Camera;
     #[pymodule_export]
     use crate::device::{close_device, device_name};
+    #[pymodule_export]
+    use crate::edit::{Editor, Selection};
     #[pymodule_export]
     use crate::scene::{Scene, load, options, reconstruct, reconstruct_pixels};
     #[pymodule_export]

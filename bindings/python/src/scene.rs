@@ -8,6 +8,7 @@ use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::{Map, Value};
+use splatvk::format::scene_dir;
 use splatvk::infer::Registry;
 use splatvk::photo;
 use splatvk::query::instances::splat_codes;
@@ -34,7 +35,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    fn of(live: LiveScene, path: Option<PathBuf>) -> Scene {
+    pub fn of(live: LiveScene, path: Option<PathBuf>) -> Scene {
         Scene {
             live: Mutex::new(live),
             process: Process::current(),
@@ -400,12 +401,22 @@ fn converted<'py>(scene: &Bound<'py, Scene>, function: &str) -> PyResult<Bound<'
     scene.py().import("splatvk._convert")?.call_method1(function, (scene,))
 }
 
-/// Loads a scene directory or a file of Gaussians.
+/// Loads a scene directory or a file of Gaussians, with the edits of the scene unless `edits` is
+/// False.
 #[pyfunction]
-#[pyo3(signature = (path, device = None, models = None))]
-pub fn load(py: Python<'_>, path: PathBuf, device: Option<&str>, models: Option<PathBuf>) -> PyResult<Scene> {
+#[pyo3(signature = (path, device = None, models = None, edits = true))]
+pub fn load(
+    py: Python<'_>,
+    path: PathBuf,
+    device: Option<&str>,
+    models: Option<PathBuf>,
+    edits: bool,
+) -> PyResult<Scene> {
     let device = device::device(py, device)?;
-    let live = work::unobserved(py, || LiveScene::load(&device, &path, &Registry::open(models.as_deref())?))?;
+    let live = work::unobserved(py, || {
+        let scene = if edits { scene_dir::load(&path) } else { scene_dir::load_unedited(&path) };
+        LiveScene::loaded(&device, scene?, &Registry::open(models.as_deref())?)
+    })?;
     Ok(Scene::of(live, Some(std::path::absolute(&path)?)))
 }
 

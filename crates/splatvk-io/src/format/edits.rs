@@ -290,6 +290,11 @@ impl EditList {
         })
     }
 
+    /// Number of splats of the reconstruction.
+    pub fn splats(&self) -> usize {
+        self.splats
+    }
+
     /// The scene after its edits; `scene` is the reconstruction.
     pub fn apply(&self, scene: Scene) -> Scene {
         apply::apply(scene, self)

@@ -218,7 +218,7 @@ mod tests {
         for name in ["NOTES.txt", "cameras/mine.json", "previews/IMG_1.jpg", "language"] {
             std::fs::write(out.join(name), "precious").unwrap();
             for force in [false, true] {
-                refused(Workspace::create(&out, force, &[]), &format!("did not write: {name};"));
+                refused(Workspace::create(&out, force, &[]), &format!("no run wrote: {name};"));
             }
             let w = Workspace::create(&out.with_file_name("other"), true, &[]).unwrap();
             let w = Workspace { out: out.clone(), ..w };
