@@ -11,6 +11,7 @@ pub mod frame;
 pub mod highlight;
 pub mod instances;
 pub mod maps;
+pub mod photos;
 pub mod phrasing;
 pub mod presence;
 mod result;

@@ -96,6 +96,7 @@ impl ShownPixels {
 }
 
 /// Codes visible in views, with their cosines to canonical phrases.
+#[derive(Default)]
 pub struct ShownCodes<'f> {
     /// [D] embedding, and the largest cosine to a canonical phrase.
     codes: Vec<(&'f [f32], f32)>,
@@ -114,6 +115,12 @@ impl<'f> ShownCodes<'f> {
             codes.extend(kept.map(|((row, common), _)| (row, *common)));
         }
         ShownCodes { codes }
+    }
+
+    /// The codes of both.
+    pub fn joined(mut self, other: ShownCodes<'f>) -> ShownCodes<'f> {
+        self.codes.extend(other.codes);
+        self
     }
 
     /// The code with the largest margin, and its margin: cosine to the text less the largest cosine
