@@ -725,6 +725,10 @@ typedef struct {
      of an installed network, or "auto" for the best of them. NULL = none.
      */
     const char *depth_prior;
+    /*
+     Things that are ignored in all photos, as by --ignore, one a line. NULL = none.
+     */
+    const char *ignore;
 } SvkTrainOptions;
 
 /*

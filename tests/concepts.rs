@@ -5,11 +5,16 @@ mod fixture;
 
 use fixture::command::{refuses, splatvk, text};
 use serde_json::Value;
+use splatlab::generate::regions::InjectedErrors;
+use splatlab::generate::{SceneSpec, generate};
+use splatvk::eval::GroundTruth;
 use splatvk::format::picture;
 use splatvk::format::scene_dir::{self, Contents};
+use splatvk::format::scene_photos;
 use splatvk::infer::Registry;
 use splatvk::infer::concepts::Concepts;
 use splatvk::infer::installed::Task;
+use splatvk::progress::Silent;
 use splatvk::scene::{Camera, Pose, RgbImage, Seen, Splats, World};
 use splatvk_test_support::onnx::{Attribute, BOOL, FLOAT, INT64, Onnx};
 use splatvk_test_support::toys::{WORDS, photo, tokenizer};
@@ -318,6 +323,43 @@ fn masks_of_photos_become_splats_and_views() {
     table.arg("query").arg(&scene).args(["dog", "red", "--concepts", "sam3", "--models"]).arg(&models);
     let table = text(&table.output().unwrap().stdout);
     assert!(table.contains("no sign of it") && table.contains("sam3 finds it in 3 of 3 photos"), "{table}");
+}
+
+/// `--ignore` takes the masks of an installed network, for words that the built-in ones do not know.
+#[test]
+fn ignored_things_are_found_by_network() {
+    let folder = tempfile::tempdir().unwrap();
+    let models = install(folder.path(), &USLS);
+    let set = folder.path().join("set");
+    let spec = SceneSpec { seed: 1001, views: 2, held_out: 1, size: (160, 120), ..SceneSpec::default() };
+    generate(&set, &spec, &InjectedErrors::NONE, &Silent).unwrap();
+    let out = folder.path().join("scene");
+    let mut train = splatvk();
+    train.arg("train").arg("--images").arg(set.join("images"));
+    train.arg("--cameras").arg(set.join("cameras_noisy.json")).arg("--models").arg(&models);
+    train.args(["--ignore", "blue", "--ignore", "dog", "--iterations", "1", "--json", "--out"]).arg(&out);
+    let output = train.output().unwrap();
+    let log = text(&output.stderr);
+    assert!(output.status.success(), "{log}");
+    assert!(log.contains("--ignore dog: found in 0 of 2 photos; nothing is ignored"), "{log}");
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let record = &report["run"]["statistics"]["ignored"];
+    assert!(record[0]["by"] == "sam3" && record[0]["photos"].as_array().unwrap().len() == 2, "{record}");
+    let truth = GroundTruth::read(&set).unwrap();
+    let photos = scene_photos::load(&out).unwrap();
+    for (photo, frame) in photos.iter().zip(&truth.frames) {
+        let objects = truth.objects(frame).unwrap().unwrap();
+        let share = |wanted: &dyn Fn(&str) -> bool| {
+            let pixels = || {
+                let phrase = |label: &u32| truth.labels.get(label).map_or("", String::as_str);
+                objects.data.iter().enumerate().filter(move |(_, label)| wanted(phrase(label)))
+            };
+            pixels().filter(|(p, _)| !photo.uses(*p)).count() as f64 / pixels().count() as f64
+        };
+        let (blue, wall) =
+            (share(&|phrase| phrase.starts_with("blue")), share(&|phrase| phrase == "plaster wall"));
+        assert!(blue > 0.9 && wall < 0.05, "{}: {blue} {wall}", photo.stem);
+    }
 }
 
 #[test]

@@ -220,6 +220,11 @@ unsafe fn config(o: &SvkTrainOptions, networks: &Inventory) -> Result<Reconstruc
             preset,
             iterations: count(o.iterations),
             sh_degree,
+            ignore: text(o.ignore, "ignore")?
+                .iter()
+                .flat_map(|list| list.lines())
+                .map(str::to_owned)
+                .collect(),
             seed: o.seed,
             ..TrainingConfig::default()
         },

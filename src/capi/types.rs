@@ -356,6 +356,8 @@ pub struct SvkTrainOptions {
     /// Source of depth where photos cannot be matched, as of --depth-prior: "dir:FOLDER", the name
     /// of an installed network, or "auto" for the best of them. NULL = none.
     pub depth_prior: *const c_char,
+    /// Things that are ignored in all photos, as by --ignore, one a line. NULL = none.
+    pub ignore: *const c_char,
 }
 
 /// Contents of a scene.

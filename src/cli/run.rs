@@ -80,12 +80,7 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
         Some(scene) => {
             let made = base::record_of(scene)?;
             // The scene's queries, then the new ones.
-            queries = made.config.plan.inputs.queries.clone();
-            for query in &args.queries {
-                if !queries.contains(query) {
-                    queries.push(query.clone());
-                }
-            }
+            queries = joined(&made.config.plan.inputs.queries, &args.queries);
             as_made(asked, &made, installed)?
         }
     };
@@ -109,6 +104,12 @@ fn plan(args: &RunArgs, installed: &Inventory) -> Result<RunPlan> {
     })
 }
 
+/// The texts of a scene, then the new ones.
+fn joined(of_scene: &[String], asked: &[String]) -> Vec<String> {
+    let new = asked.iter().filter(|text| !of_scene.contains(text));
+    of_scene.iter().chain(new).cloned().collect()
+}
+
 /// Configuration of photos that join a scene: unset options are those of the scene.
 fn as_made(
     asked: ReconstructionConfig,
@@ -120,7 +121,11 @@ fn as_made(
     let language = asked.language.unwrap_or_default();
     ReconstructionConfig {
         geometry: GeometryConfig::default(),
-        training: TrainingConfig { preset: asked.training.preset.or(made.config.preset), ..asked.training },
+        training: TrainingConfig {
+            preset: asked.training.preset.or(made.config.preset),
+            ignore: joined(&made.config.plan.config.training.ignore, &asked.training.ignore),
+            ..asked.training
+        },
         language: Some(LanguageConfig {
             matcher: source_as_made::<MatchSources>(language.matcher, of_scene.matcher, installed)?,
             masks: source_as_made::<MaskSources>(language.masks, of_scene.masks, installed)?,

@@ -3,6 +3,7 @@
 //! The command line flattens these structures into its options, the C structure maps to them once,
 //! and `run.json` stores them. Photos, files and machine are apart from it (`run::plan`).
 use super::compat::{self, Compat};
+use super::ignored;
 use super::method::{Method, Recipe};
 use super::paper::{self, PaperSources};
 use super::sources::{
@@ -48,7 +49,7 @@ pub struct GeometryConfig {
     pub depth_prior: SourceChoice,
 }
 
-/// Working size and training of the splats.
+/// Use and working size of the photos, and training of the splats.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "cli", derive(clap::Args))]
 #[serde(default)]
@@ -67,6 +68,10 @@ pub struct TrainingConfig {
     /// photos support that are left out for a test; 0 for fewer than four photos]
     #[cfg_attr(feature = "cli", arg(long, value_name = "0-3", value_parser = whole::<u32>(0..=3), help_heading = EXPERTS))]
     pub sh_degree: Option<u32>,
+    /// Ignore a thing in all photos, as a mask does: what comes and goes, such as a person or a car;
+    /// may be repeated
+    #[cfg_attr(feature = "cli", arg(long, value_name = "TEXT"))]
+    pub ignore: Vec<String>,
     /// Seed of everything random
     #[cfg_attr(feature = "cli", arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u64>(0..), help_heading = EXPERTS))]
     pub seed: u64,
@@ -214,6 +219,7 @@ impl ReconstructionConfig {
     /// # Errors
     /// A setting, with the values that can be given.
     pub fn check(&self) -> Result<()> {
+        ignored::check(&self.training.ignore)?;
         match &self.language {
             Some(language) => language.check(self.training.preset),
             None => Ok(()),

@@ -10,7 +10,7 @@ use super::remaining::{WithRemaining, Work};
 use super::sources::{self, GraphBuilder};
 use super::stages::{CameraOrigin, GivenViews, PlacedPhotos};
 use super::view::Viewer;
-use super::{label, photos, points, summary};
+use super::{ignored, label, photos, points, summary};
 use crate::format::scene_dir::{self, Contents};
 use crate::format::{Workspace, cameras, edits};
 use crate::gpu::Device;
@@ -144,7 +144,7 @@ impl Reconstruction<'_> {
         self,
         device: &Device,
         registry: &Registry,
-        photos: Vec<Photo>,
+        mut photos: Vec<Photo>,
         store: &Store,
         progress: &Recorded,
     ) -> Result<RunOutcome> {
@@ -153,7 +153,7 @@ impl Reconstruction<'_> {
         config.check()?;
         // Given cameras and points need no network.
         let given = matches!(&start, Start::Photos(Some(origin)) if matches!(**origin, CameraOrigin::GivenGeometry(_)));
-        let needs_networks = config.language.is_some() || !given;
+        let needs_networks = config.language.is_some() || !given || !config.training.ignore.is_empty();
         if needs_networks {
             registry.compute().report(progress)?;
         }
@@ -162,6 +162,7 @@ impl Reconstruction<'_> {
         if needs_networks {
             graph::check(config, &photos, registry)?;
         }
+        let ignored = ignored::apply(config, &mut photos, device, registry, store, progress)?;
         let preset = config.preset_on(device);
         let training = config.rgb_options(preset, device, photos.len());
         remaining.plan(&Work {
@@ -231,6 +232,7 @@ impl Reconstruction<'_> {
             device: device.info().clone(),
             choice: None,
             photos,
+            ignored,
             left_out,
             geometry,
             known: base.as_ref().map_or(0, |b| b.known.photos.len()),

@@ -12,6 +12,7 @@ pub mod encoder;
 mod execute;
 mod fidelity;
 mod graph;
+mod ignored;
 mod label;
 mod light;
 pub mod live;

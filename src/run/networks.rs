@@ -1,5 +1,6 @@
 //! Networks of the user in a run: found before any work, listed in run.json.
 use super::config::ReconstructionConfig;
+use super::ignored;
 use super::plan::RunPlan;
 use super::sources::{DepthSources, FeatureSources, GeometrySources, MaskSources, MatchSources, installed};
 use crate::Result;
@@ -36,7 +37,13 @@ impl Networks {
             found.push(installed::<MaskSources>(&language.masks, registry)?);
             found.push(installed::<FeatureSources>(&language.features, registry)?);
         }
-        Ok(Networks(found.into_iter().flatten().collect()))
+        let mut found: Vec<Installed> = found.into_iter().flatten().collect();
+        for network in ignored::networks(config, registry)? {
+            if found.iter().all(|f| f.name != network.name) {
+                found.push(network);
+            }
+        }
+        Ok(Networks(found))
     }
 
     /// Whether built-in methods do all of the work.

@@ -1,5 +1,6 @@
 //! The result of a run.
 use super::answer::Answers;
+use super::ignored::Ignored;
 use super::plan::RunPlan;
 use super::view::DecodedFrame;
 use crate::fit;
@@ -26,6 +27,8 @@ pub struct RunOutcome {
     pub choice: Option<pose::choose::Choice>,
     /// Photos at working resolution.
     pub photos: Vec<Photo>,
+    /// Things that were ignored in the photos.
+    pub ignored: Vec<Ignored>,
     /// Photos that could not be registered reliably.
     pub left_out: Vec<pose::choose::LeftOut>,
     /// Number of leading photos that an extended scene already had; 0 for a new scene.

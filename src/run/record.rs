@@ -152,6 +152,7 @@ fn statistics(o: &RunOutcome) -> Statistics {
     let other = json!({
         "photos": o.photos.iter().map(|p| p.path.display().to_string()).collect::<Vec<_>>(),
         "choice": o.choice,
+        "ignored": o.ignored,
         "left_out": o.left_out,
         "added": added(o),
         "working_sizes": working_sizes(&o.photos),

@@ -117,6 +117,7 @@ fn figures(o: &RunOutcome) -> Vec<Figure> {
             super::fidelity::figure(&o.psnr),
         ],
     };
+    list.extend(super::ignored::figure(&o.ignored));
     list.extend(confidence_figure(&o.photos, &o.geometry.fitted, &o.psnr).map(|text| {
         let meaning = "How well the photos agree on where they were taken. Below high, shapes and lengths may be wrong.";
         Figure::that_matters("cameras", text, meaning)

@@ -4,6 +4,7 @@ mod added;
 mod answers;
 mod cameras;
 mod given;
+mod ignored;
 mod language;
 pub mod masks;
 mod matches;
@@ -15,6 +16,7 @@ pub use added::{AddedCameras, AddedDepth, AlignAdded, KnownUp, OnlyAdded, OnlyAd
 pub use answers::{AnswerQueries, DecodeViews};
 pub use cameras::{CameraOrigin, Cameras, DenseDepth, KnownGeometry, PlacedPhotos, Upright};
 pub use given::{GivenGeometry, GivenPhotos, GivenSplats, GivenViews, LiftLanguage, ReprojectedMatches};
+pub use ignored::{FindByNetwork, FindByWords, UnplacedPhotos};
 pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage};
 pub use masks::{
     ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures, SurfaceFeatures,

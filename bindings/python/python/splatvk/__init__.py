@@ -104,7 +104,7 @@ def reconstruct(photos, *, out=None, views=None, queries=(), language=True, prog
         exceptions stop the work. Warnings go to the logger `splatvk` unless a callable takes them.
     **options
         Options of `splatvk run` with underscores: `preset`, `max_size`, `iterations`, `seed`,
-        `device`, `models`, `force`, `resume`, `init`, `photo_masks`, `sh_degree`, ...
+        `device`, `models`, `force`, `resume`, `init`, `photo_masks`, `ignore`, `sh_degree`, ...
 
     Returns
     -------
