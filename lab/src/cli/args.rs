@@ -36,6 +36,8 @@ pub enum Command {
     Alignment(AlignmentArgs),
     /// Synthetic scene with ground truth, as hard as asked
     Generate(GenerateArgs),
+    /// Scene of data with a walker → error of its views where the walker was, and elsewhere
+    Ghosts(GhostsArgs),
     /// Scene against the labels of LERF-OVS, 3D-OVS or ScanNet → figures of their protocols
     Eval(EvalArgs),
     /// Scene against polygons on its photos → how useful its answers are to a user
@@ -118,6 +120,19 @@ pub struct AskArgs {
     /// Folder of label files as in LERF-OVS, one per photo, and texts.json
     #[arg(long, value_name = "DIR")]
     pub labels: PathBuf,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatlab ghosts`
+#[derive(Debug, Args)]
+pub struct GhostsArgs {
+    /// Scene directory
+    pub scene: PathBuf,
+    /// Folder of `splatlab generate --walker`
+    #[arg(long, value_name = "DIR")]
+    pub ground_truth: PathBuf,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
@@ -462,6 +477,11 @@ pub struct GenerateArgs {
     /// its own, where the other options ask for them
     #[arg(long)]
     pub two_cameras: bool,
+    /// A person walks through while the photos are taken: a figure in all photos but one, each time
+    /// elsewhere. clean/ has the photos without it, used/ its masks for --photo-masks; held-out
+    /// views, depth, masks and regions are those without it
+    #[arg(long)]
+    pub walker: bool,
     /// Photos of which no right scene, or only part of one, can be made
     #[arg(long, value_name = "WAY", value_parser = spoils())]
     pub spoil: Option<Spoil>,

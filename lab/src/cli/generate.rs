@@ -69,6 +69,7 @@ fn spec(args: &GenerateArgs) -> Result<SceneSpec> {
         flat: args.flat,
         outdoor: args.outdoor,
         effects,
+        walker: args.walker,
         spoil: args.spoil,
     })
 }

@@ -8,6 +8,7 @@ mod curve;
 mod eval;
 mod figures;
 mod generate;
+mod ghosts;
 mod mesh_accuracy;
 mod study;
 
@@ -25,8 +26,12 @@ pub fn main() -> ExitCode {
 impl Program for Lab {
     const NAME: &'static str = "splatlab";
 
-    const UNUSED: &'static [(&'static str, &'static [&'static str])] =
-        &[("generate", &["provider", "log"]), ("alignment", &["provider"]), ("mesh-accuracy", &["provider"])];
+    const UNUSED: &'static [(&'static str, &'static [&'static str])] = &[
+        ("generate", &["provider", "log"]),
+        ("ghosts", &["provider", "log"]),
+        ("alignment", &["provider"]),
+        ("mesh-accuracy", &["provider"]),
+    ];
 
     fn log(&self) -> LogFormat {
         self.global.log
@@ -48,6 +53,7 @@ impl Program for Lab {
             }
             Command::Alignment(args) => alignment::alignment(&args),
             Command::Generate(args) => generate::generate(&args),
+            Command::Ghosts(args) => ghosts::ghosts(&args),
             Command::Eval(mut args) => {
                 args.device.provider = self.global.provider;
                 eval::eval(&args)

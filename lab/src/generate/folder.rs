@@ -12,12 +12,18 @@ use splatvk::format::npy::{self, NpyArray, NpyData};
 use splatvk::format::picture::Jpeg;
 use splatvk::format::{cameras, create_folder, picture, write_json};
 use splatvk::progress::Progress;
-use splatvk::scene::Camera;
+use splatvk::scene::{Camera, RgbImage};
 use splatvk_types::files;
 use std::path::Path;
 
 /// Folders of regions without and with injected errors.
 const REGIONS: [&str; 2] = ["regions_exact", "regions_flawed"];
+
+/// Folder of the photos without the walker.
+pub const CLEAN: &str = "clean";
+
+/// Folder of masks of the photos for `--photo-masks`: black where the walker is.
+pub const USED: &str = "used";
 
 /// File of the ground truth.
 const TRUTH: &str = "ground_truth.json";
@@ -47,7 +53,8 @@ pub fn foreign(folder: &Path) -> Option<Vec<String>> {
 /// have any views.
 fn is_own(name: &str, is_folder: bool, views: Option<&[&str]>) -> bool {
     let Some((folder, file)) = name.rsplit_once('/') else {
-        let folders: &[&str] = if views.is_some() { &["images", "held_out", "depth", "masks"] } else { &[] };
+        let folders: &[&str] =
+            if views.is_some() { &["images", "held_out", "depth", "masks", CLEAN, USED] } else { &[] };
         return match is_folder {
             true => REGIONS.contains(&name) || folders.contains(&name),
             false => views.is_some() && [TRUTH, "cameras_noisy.json"].contains(&name),
@@ -59,14 +66,15 @@ fn is_own(name: &str, is_folder: bool, views: Option<&[&str]>) -> bool {
     !is_folder
         && match folder {
             "images" | "held_out" => views.is_some_and(|all| all.contains(&name)),
+            CLEAN => stem(".jpg"),
             "depth" => stem(".npz"),
-            "masks" => stem(".png"),
+            "masks" | USED => stem(".png"),
             _ => REGIONS.contains(&folder) && (file == TEXTS || stem("_s.npy") || stem("_f.npy")),
         }
 }
 
 /// Makes a scene and writes it: photos, held-out views, depth, masks, cameras, and regions without
-/// and with injected errors.
+/// and with injected errors. With a walker, the photos show it and everything else does not.
 pub fn generate(
     folder: &Path,
     spec: &SceneSpec,
@@ -74,7 +82,8 @@ pub fn generate(
     progress: &dyn Progress,
 ) -> Result<()> {
     let scene = photos::build(spec)?;
-    for name in ["images", "held_out", "depth", "masks"] {
+    let walked: &[&str] = if spec.walker { &[CLEAN, USED] } else { &[] };
+    for name in ["images", "held_out", "depth", "masks"].iter().chain(walked) {
         create_folder(&folder.join(name))?;
     }
     let frames = write_views(folder, &scene, spec, progress)?;
@@ -113,7 +122,14 @@ fn write_views(
         frames.push(match scene.photo_effects.get(i) {
             Some(effects) => {
                 let jpeg = Jpeg { quality, exif: shown.exif(i)? };
-                let file = write_view(folder, &effects.camera, Split::Train, &shown.render(i, seed), jpeg)?;
+                let mut seen = shown.render(i, seed);
+                if let Some(passed) = shown.passed(i, seed) {
+                    let name = &effects.camera.name;
+                    write_jpeg(&folder.join(CLEAN).join(format!("{name}.jpg")), &seen.image, jpeg.clone())?;
+                    picture::write_mask_png(&folder.join(USED).join(format!("{name}.png")), &passed.used)?;
+                    seen.image = passed.image;
+                }
+                let file = write_view(folder, &effects.camera, Split::Train, &seen, jpeg)?;
                 let mut frame = frame_json(&effects.camera, Split::Train, &file);
                 if let Some(lens) = &effects.lens {
                     frame["lens"] = json!(lens);
@@ -148,11 +164,14 @@ pub fn write_regions(data: &Path, out: &Path, flaws: &InjectedErrors) -> Result<
     Ok(())
 }
 
+fn write_jpeg(path: &Path, image: &RgbImage, jpeg: Jpeg) -> Result<()> {
+    std::fs::write(path, picture::jpeg_bytes(image, jpeg)?).map_err(Error::unwritable(path))
+}
+
 fn write_view(folder: &Path, camera: &Camera, split: Split, seen: &RayCast, jpeg: Jpeg) -> Result<String> {
     let place = if split == Split::Train { "images" } else { "held_out" };
     let (name, file) = (&camera.name, format!("{place}/{}.jpg", camera.name));
-    let path = folder.join(&file);
-    std::fs::write(&path, picture::jpeg_bytes(&seen.image, jpeg)?).map_err(Error::unwritable(&path))?;
+    write_jpeg(&folder.join(&file), &seen.image, jpeg)?;
     let shape = vec![seen.depth.height, seen.depth.width];
     let depth = NpyData::F16(seen.depth.data.iter().map(|z| f16::from_f32(*z)).collect());
     let path = folder.join("depth").join(format!("{name}.npz"));

@@ -3,9 +3,10 @@ use super::render::{self, RayCast};
 use super::scene::{SceneSpec, SyntheticScene, build_scene};
 use super::shapes::Shape;
 use super::spoil::Spoil;
+use super::walker::{self, Walker};
 use crate::{Error, Result};
 use glam::{DMat3, DVec3};
-use splatvk::scene::Pose;
+use splatvk::scene::{Image, Pose, RgbImage};
 
 /// Index of the spoilt photo where the fault concerns one photo: neither the first nor the last.
 const SPOILT_PHOTO: usize = 1;
@@ -27,6 +28,15 @@ pub(super) struct Photos<'a> {
     spec: &'a SceneSpec,
     /// Scene that some of the photos show instead.
     other: Option<SyntheticScene>,
+    walker: Option<Walker>,
+}
+
+/// A photo with a passer-by.
+pub(super) struct Passed {
+    /// The picture.
+    pub image: RgbImage,
+    /// Pixels that the passer-by does not touch.
+    pub used: Image<bool>,
 }
 
 /// Builds the scene of a specification, with the faults that concern all photos alike.
@@ -64,7 +74,8 @@ impl<'a> Photos<'a> {
             Some(Spoil::Moving) => Some(with_moved_object(scene, spec.unit())),
             _ => None,
         };
-        Ok(Photos { scene, spec, other })
+        let walker = spec.walker.then(|| Walker::new(spec, scene)).transpose()?;
+        Ok(Photos { scene, spec, other, walker })
     }
 
     /// Renders photo `i`; its noise is drawn from `seed`.
@@ -83,6 +94,19 @@ impl<'a> Photos<'a> {
             }
         }
         seen
+    }
+
+    /// Photo `i` with the walker of the specification, if there is one; its noise is drawn from
+    /// `seed`.
+    pub(super) fn passed(&self, i: usize, seed: u64) -> Option<Passed> {
+        let walker = self.walker.as_ref()?;
+        let effects = &self.scene.photo_effects[i];
+        let with = walker.scene(self.scene, i);
+        let scene = with.as_ref().unwrap_or(self.scene);
+        let image = render::photo(scene, effects, self.spec.photo_noise, seed).image;
+        let mut used = render::shows(scene, &effects.camera, effects.lens.as_ref(), walker::LABEL);
+        used.data.iter_mut().for_each(|shown| *shown = !*shown);
+        Some(Passed { image, used })
     }
 
     /// EXIF data of photo `i`; `None`: its file has none.
@@ -127,7 +151,6 @@ fn with_moved_object(scene: &SyntheticScene, unit: f64) -> SyntheticScene {
 mod tests {
     use super::*;
     use splatvk::pass::metrics::psnr;
-    use splatvk::scene::RgbImage;
 
     fn photos(spoil: Option<Spoil>) -> (SyntheticScene, Vec<RgbImage>) {
         let spec =

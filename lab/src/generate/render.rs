@@ -32,7 +32,7 @@ pub struct RayCast {
 }
 
 /// Nearest object on a ray, with the hit.
-fn first_hit(scene: &SyntheticScene, from: DVec3, ray: DVec3) -> Option<(&SceneObject, Hit)> {
+pub(super) fn first_hit(scene: &SyntheticScene, from: DVec3, ray: DVec3) -> Option<(&SceneObject, Hit)> {
     let hits = scene.objects.iter().filter_map(|t| t.shape.hit(from, ray).map(|h| (t, h)));
     hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
 }
@@ -42,8 +42,7 @@ fn colour(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, (x, y): 
     let to_world = camera.pose.inverse();
     let mut sum = [0.0; 3];
     for k in 0..SAMPLES * SAMPLES {
-        let offset = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
-        let pixel = DVec2::new(x + offset(k % SAMPLES), y + offset(k / SAMPLES));
+        let pixel = sample(x, y, k);
         let ray = lens.map_or_else(|| camera.ray(pixel), |l| l.ray(camera, pixel));
         let direction = to_world.rotation * ray;
         let shown = match (first_hit(scene, to_world.translation, direction), &scene.sky) {
@@ -72,6 +71,27 @@ fn picture(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, noise: 
         shown.map(|v| v.clamp(0.0, 1.0) as f32)
     };
     RgbImage { width, height, data: (0..width * height).into_par_iter().map(noisy_colour).collect() }
+}
+
+/// Pixels of a photo that show any of an object, through a lens if there is one.
+pub(super) fn shows(scene: &SyntheticScene, camera: &Camera, lens: Option<&Lens>, label: u32) -> Image<bool> {
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let to_world = camera.pose.inverse();
+    let shown = |p: usize| {
+        (0..SAMPLES * SAMPLES).any(|k| {
+            let pixel = sample((p % width) as f64, (p / width) as f64, k);
+            let ray = lens.map_or_else(|| camera.ray(pixel), |l| l.ray(camera, pixel));
+            let hit = first_hit(scene, to_world.translation, to_world.rotation * ray);
+            hit.is_some_and(|(object, _)| object.label == label)
+        })
+    };
+    Image { width, height, data: (0..width * height).into_par_iter().map(shown).collect() }
+}
+
+/// Position of ray `k` of a pixel.
+fn sample(x: f64, y: f64, k: usize) -> DVec2 {
+    let offset = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
+    DVec2::new(x + offset(k % SAMPLES), y + offset(k / SAMPLES))
 }
 
 /// Renders a view without effects of its camera; `noise` is the standard deviation of its noise,

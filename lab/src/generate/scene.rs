@@ -56,6 +56,9 @@ pub struct SceneSpec {
     pub outdoor: bool,
     /// Effects of a phone camera on the photos; held-out views have none.
     pub effects: Effects,
+    /// Whether a person walks through the scene while the photos are taken.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub walker: bool,
     /// Fault of the photo set.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub spoil: Option<Spoil>,
@@ -83,6 +86,7 @@ impl Default for SceneSpec {
             flat: None,
             outdoor: false,
             effects: Effects::default(),
+            walker: false,
             spoil: None,
         }
     }
@@ -136,6 +140,9 @@ impl SceneSpec {
             }
             k if !(1.0..=80.0).contains(&k.baseline) => "--baseline: 1 to 80 degrees",
             k if !(0.25..=4.0).contains(&k.zoom) => "--zoom: 0.25 to 4",
+            k if k.walker && (k.flat.is_some() || k.spoil.is_some()) => {
+                "--walker: without --flat and --spoil"
+            }
             k if k.flat.is_some() && (k.outdoor || k.beyond || k.similar + k.thin > 0) => {
                 "--flat holds sheets alone: without --outdoor, --beyond, --similar and --thin"
             }
