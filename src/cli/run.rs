@@ -227,10 +227,14 @@ mod tests {
     #[test]
     fn added_photos_take_sources_of_scene() {
         let folder = tempfile::tempdir().unwrap();
-        let made = serde_json::json!({ "method": "lift", "masks": "dir:src", "features": "dir:tests" });
+        let made = serde_json::json!({
+            "method": "lift", "masks": "dir:src", "features": "dir:tests", "ignore": ["person"],
+        });
         let record = serde_json::json!({ "config": { "plan": made } });
         std::fs::write(folder.path().join("run.json"), record.to_string()).unwrap();
-        let plan = plan(&["--add", folder.path().to_str().unwrap(), "--features", "words"]).unwrap();
+        let scene = folder.path().to_str().unwrap();
+        let plan = plan(&["--add", scene, "--features", "words", "--ignore", "car"]).unwrap();
+        assert_eq!(plan.config.training.ignore, ["person", "car"]);
         let language = language(&plan);
         assert_eq!(language.masks, SourceChoice::with("dir", "src"));
         assert_eq!(
@@ -317,6 +321,7 @@ mod tests {
             (["--matcher", "sift"], "auto, xfeat, mast3r, roma"),
             (["--feature-dim", "5"], "3, 8 or 16"),
             (["--query", " "], "a few words"),
+            (["--ignore", " "], "--ignore: "),
             (["--method=langsplat", "--feature-dim=16"], "has 3 dimensions"),
         ] {
             let error = plan(&extra).and_then(|plan| plan.inputs.check()).unwrap_err();

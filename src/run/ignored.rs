@@ -23,6 +23,10 @@ const RIM: f64 = 1.0 / 128.0;
 /// Share of a photo that is left, below which a warning names it.
 const LITTLE: f64 = 0.25;
 
+/// Advice where no masks are made.
+const WAY_OUT: &str =
+    "give masks (--photo-masks DIR) or install a network that finds it (splatvk models fetch sam3)";
+
 /// A text that was ignored.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Ignored {
@@ -142,7 +146,7 @@ pub(super) fn apply(
         }
         let line = format!("--ignore {text}: {}", ignored.sentence());
         match ignored.photos.is_empty() {
-            true => progress.warn(&line),
+            true => progress.warn(&format!("{line}. If it is there, {WAY_OUT}")),
             false => progress.inform(&line),
         }
         all.push(ignored);
@@ -207,8 +211,7 @@ fn known(
     match unknown.is_empty() {
         true => Ok(queries),
         false => Err(Error::input(format!(
-            "--ignore {}: the built-in words do not know it; name a common thing, give masks (--photo-masks DIR), or install a network \
-             that finds any text (splatvk models list)",
+            "--ignore {}: the built-in words do not know it; name a common thing, {WAY_OUT}",
             files::listed(&unknown)
         ))),
     }

@@ -44,6 +44,7 @@ pub use answer::Answers;
 pub use compat::Compat;
 pub use config::{GeometryConfig, LanguageConfig, ReconstructionConfig, TrainingConfig};
 pub use execute::{reconstruct, run, save, stage_folder};
+pub use ignored::{Ignored, IgnoredPart};
 pub use method::{FEATURE_DIM, Method, Recipe};
 pub use networks::models_used;
 pub use outcome::RunOutcome;

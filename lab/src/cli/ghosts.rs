@@ -83,32 +83,36 @@ fn share(part: usize, of: usize) -> Option<f64> {
     (of > 0).then(|| part as f64 / of as f64)
 }
 
-/// The picture without the passer-by, and the pixels that show it, as the scene has its photo:
-/// undistorted, at the working size.
+/// The picture without the passer-by, and the pixels that show it, as the scene has its photo: at
+/// the working size, without cut bars, undistorted.
 fn truth(folder: &Path, photo: &Photo) -> Result<(RgbImage, Image<bool>)> {
-    let size = (photo.image.width, photo.image.height);
+    let (width, height) = (photo.image.width, photo.image.height);
+    let whole = [0, 1].map(|k| {
+        let side = if k == 0 { photo.original_size.0 } else { photo.original_size.1 };
+        (f64::from(side) * photo.to_working.scale[k]).round() as usize
+    });
+    let [left, top] = photo.to_working.offset.map(|v| (-v).round().max(0.0) as usize);
     let read = |name: &str, ending: &str| {
         let path = folder.join(name).join(format!("{}.{ending}", photo.stem));
-        let mut image = photo::load_at(&path, size.0.max(size.1))?.image;
-        if let Some(lens) = &photo.straightened {
-            image = lens.image(&image);
+        let image = photo::load_at(&path, whole[0].max(whole[1]))?.image;
+        if [image.width, image.height] != whole || left + width > image.width || top + height > image.height {
+            return Err(Error::input(format!(
+                "{}: {} × {} pixels, the scene's photo has {} × {}",
+                path.display(),
+                image.width,
+                image.height,
+                whole[0],
+                whole[1]
+            )));
         }
-        if (image.width, image.height) == size {
-            return Ok(image);
-        }
-        Err(Error::input(format!(
-            "{}: {} × {} pixels, the scene's photo has {} × {}",
-            path.display(),
-            image.width,
-            image.height,
-            size.0,
-            size.1
-        )))
+        let data = (0..width * height).map(|p| image.at(left + p % width, top + p / width)).collect();
+        let cut = RgbImage { width, height, data };
+        Ok(photo.straightened.as_ref().map_or_else(|| cut.clone(), |lens| lens.image(&cut)))
     };
     let used = read(USED, "png")?;
     // Averages at the rim of the mask have a part of the passer-by.
     let data = used.data.iter().map(|v| v[0] < 0.999).collect();
-    Ok((read(CLEAN, "jpg")?, Image { width: size.0, height: size.1, data }))
+    Ok((read(CLEAN, "jpg")?, Image { width, height, data }))
 }
 
 fn text(record: &Value) -> String {
