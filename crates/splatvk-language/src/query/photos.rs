@@ -90,8 +90,8 @@ impl<'p> Compared<'p> {
     }
 }
 
-/// Finds a text in photos. The presence test of queries decides for all photos together and for each
-/// of them; the mask of a photo is that of a query.
+/// Finds a text in photos. The presence test of queries decides for all photos together and for
+/// each of them; the mask of a photo is that of a query.
 ///
 /// # Errors
 /// Embeddings of two spaces.
