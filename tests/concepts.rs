@@ -11,9 +11,9 @@ use splatvk::eval::GroundTruth;
 use splatvk::format::picture;
 use splatvk::format::scene_dir::{self, Contents};
 use splatvk::format::scene_photos;
-use splatvk::infer::Registry;
 use splatvk::infer::concepts::Concepts;
 use splatvk::infer::installed::Task;
+use splatvk::infer::{PackFileKind, Registry};
 use splatvk::progress::Silent;
 use splatvk::scene::{Camera, Pose, RgbImage, Seen, Splats, World};
 use splatvk_test_support::onnx::{Attribute, BOOL, FLOAT, INT64, Onnx};
@@ -330,6 +330,9 @@ fn masks_of_photos_become_splats_and_views() {
 fn ignored_things_are_found_by_network() {
     let folder = tempfile::tempdir().unwrap();
     let models = install(folder.path(), &USLS);
+    // Points of given cameras are triangulated from built-in keypoints.
+    let keypoints = Registry::open(None).unwrap().path(PackFileKind::Keypoints).unwrap();
+    std::fs::copy(&keypoints, models.join(keypoints.file_name().unwrap())).unwrap();
     let set = folder.path().join("set");
     let spec = SceneSpec { seed: 1001, views: 2, held_out: 1, size: (160, 120), ..SceneSpec::default() };
     generate(&set, &spec, &InjectedErrors::NONE, &Silent).unwrap();
