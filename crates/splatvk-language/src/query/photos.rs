@@ -126,8 +126,9 @@ mod tests {
 
     fn row(at: usize, cosine: f32) -> Vec<f32> {
         let mut row = vec![0.0; DIM];
-        row[at] = cosine;
+        // A part of the rest is the canonical phrase's.
         row[2] = (1.0 - cosine * cosine).sqrt() * 0.2;
+        row[at] = cosine;
         row
     }
 
