@@ -250,6 +250,7 @@ fn write_scene(folder: &Path, s: &Splats, field: Option<&LanguageField>) {
         splats: s,
         seen: &Seen::default(),
         backdrop: &Default::default(),
+        holes: &Default::default(),
         cameras: &[camera],
         world: &World::default(),
         photos: &[],

@@ -256,6 +256,7 @@ fn scene_keeps_pixel_coverage() {
             splats: &splats,
             seen: &Seen { pixels: vec![3.0] },
             backdrop: &Default::default(),
+            holes: &Default::default(),
             cameras: &[camera("a.png"), camera("b.png")],
             world: &World::default(),
             photos: &photos,

@@ -4,6 +4,7 @@ use exif::experimental::Writer as ExifWriter;
 use exif::{Field, In, Tag, Value};
 use image::{DynamicImage, ImageEncoder, ImageFormat};
 use sha2::{Digest, Sha256};
+use splatvk::format::edits::{Combine, Edit, EditList, Operation, Pick, Rows, Term};
 use splatvk::format::npy::{self as npy_format, NpyArray};
 use splatvk::format::scene_dir::{self, Contents};
 use splatvk::format::{
@@ -259,12 +260,20 @@ fn scene_files() -> Vec<(String, Vec<u8>)> {
         language: Some(&field),
         text_embeddings: None,
     };
-    made(|f| scene_dir::write(f, &contents).unwrap())
+    made(|f| {
+        scene_dir::write(f, &contents).unwrap();
+        let scene = scene_dir::load(f).unwrap();
+        let pick = Pick::Word { text: "a mug".into(), grow: 0.0 };
+        let selection = vec![Term { combine: Combine::Add, pick }];
+        let (before, mut list) = (EditList::new(&s), EditList::new(&s));
+        list.push(Edit { operation: Operation::Delete {}, selection, splats: Rows::of([1, 4]) });
+        list.replace(&before, &scene).unwrap();
+    })
 }
 
 /// A scene directory; every file that is loaded is damaged.
 pub fn scene() -> Vec<Seed> {
-    let plain = ["scene.json", "point_cloud.ply", "seen.npy", "cameras/transforms.json"];
+    let plain = ["scene.json", "point_cloud.ply", "seen.npy", "edits.json", "cameras/transforms.json"];
     scene_files()
         .into_iter()
         .filter_map(|(n, b)| match &*n {

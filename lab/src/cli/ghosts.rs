@@ -4,6 +4,7 @@ use super::args::GhostsArgs;
 use crate::generate::{CLEAN, USED};
 use crate::{Error, Result};
 use serde_json::{Value, json};
+use splatvk::cli::args::EditUse;
 use splatvk::cli::print::{print, print_json};
 use splatvk::cli::scene;
 use splatvk::format::scene_photos;
@@ -47,7 +48,7 @@ struct Overlap {
 }
 
 pub fn ghosts(args: &GhostsArgs) -> Result<()> {
-    let scene = scene::load(&args.scene)?;
+    let scene = scene::load(&args.scene, EditUse::default())?;
     let photos = scene_photos::load(&args.scene)?;
     let device = gpu::open(args.device.device.as_deref())?;
     let mut viewer = Viewer::new(&device, &scene.splats, &LanguageField::default())?;
