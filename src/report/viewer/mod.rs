@@ -30,18 +30,24 @@ const REPORT_SPLATS: usize = 300_000;
 const THUMBNAIL: usize = 104;
 
 /// Import name and text of each module.
-const MODULES: [(&str, &str); 13] = [
+const MODULES: [(&str, &str); 19] = [
     ("splatvk/camera", include_str!("camera.js")),
+    ("splatvk/card", include_str!("card.js")),
     ("splatvk/controls", include_str!("controls.js")),
     ("splatvk/frame", include_str!("frame.js")),
     ("splatvk/measure", include_str!("measure.js")),
     ("splatvk/motion", include_str!("motion.js")),
     ("splatvk/names", include_str!("names.js")),
-    ("splatvk/preview", include_str!("preview.js")),
+    ("splatvk/page", include_str!("page.js")),
     ("splatvk/pick", include_str!("pick.js")),
+    ("splatvk/preview", include_str!("preview.js")),
+    ("splatvk/queries", include_str!("queries.js")),
     ("splatvk/render", include_str!("render.js")),
+    ("splatvk/show", include_str!("show.js")),
     ("splatvk/sort", include_str!("sort.js")),
     ("splatvk/splats", include_str!("splats.js")),
+    ("splatvk/stage", include_str!("stage.js")),
+    ("splatvk/start", include_str!("start.js")),
     ("splatvk/things", include_str!("things.js")),
     ("splatvk/viewer", include_str!("viewer.js")),
 ];
@@ -160,9 +166,8 @@ impl Scene3d<'_> {
         let packed = pack(self.splats, self.seen, self.backdrop, self.language, REPORT_SPLATS)?;
         let data = STANDARD.encode(&packed.bytes);
         let note = format!(
-            "{} of {} splats, {:.1} MB in this page. splatvk view SCENE shows all of them and answers any question.",
-            packed.shown,
-            packed.total,
+            "{}, {:.1} MB in this page. splatvk view SCENE answers any question.",
+            shown_of(&packed),
             data.len() as f64 / 1e6
         );
         let manifest =
@@ -178,10 +183,10 @@ impl Scene3d<'_> {
         manifest["presented"] = true.into();
         let data = STANDARD.encode(&packed.bytes);
         let splats = format!("<script type=\"text/plain\" id=\"v-splats\">{data}</script>");
-        let (shown, total) = (thousands(packed.shown), thousands(packed.total));
         let caption = format!(
-            "<header class=\"v-caption\"><h1>{}</h1><p>{shown} of {total} splats, {:.1} MB</p></header>",
+            "<header class=\"v-caption\"><h1>{}</h1><p>{}, {:.1} MB</p></header>",
             escape(self.title),
+            shown_of(&packed),
             data.len() as f64 / 1e6
         );
         let html = self.whole_page(&manifest, &splats);
@@ -253,6 +258,14 @@ impl Scene3d<'_> {
     }
 }
 
+/// Number of shown splats, and of all where some are left out.
+fn shown_of(packed: &Packed) -> String {
+    match (packed.shown, packed.total) {
+        (shown, total) if shown < total => format!("{} of {} splats", thousands(shown), thousands(total)),
+        (shown, _) => format!("{} splats", thousands(shown)),
+    }
+}
+
 fn view(camera: &Camera, photo: Option<&RgbImage>) -> Result<Value> {
     let thumbnail = match photo {
         Some(photo) if photo.height > 0 => {
@@ -320,7 +333,7 @@ mod tests {
             suggested: vec!["mug".into()],
         };
         let (html, note) = scene.embedded().unwrap();
-        assert!(note.contains(&format!("of {} splats", splats.len())), "{note}");
+        assert!(note.contains(" splats, "), "{note}");
         assert_eq!(html.matches("</script>").count(), 4, "manifest, splats, import map, start");
         let manifest = html.split("id=\"v-manifest\">").nth(1).unwrap().split("</script>").next().unwrap();
         let manifest: Value = serde_json::from_str(manifest).unwrap();

@@ -1,6 +1,6 @@
 // Movement of the camera: flights to photos, walking, turning, and the resolution of moving
 // pictures.
-import { Camera, sub } from "splatvk/camera";
+import { Camera } from "splatvk/camera";
 
 const SECONDS_PER_LEG = 1.6;
 /// Angle by which the first view turns to both sides, radians, time of a turn, and number of turns:
@@ -17,23 +17,6 @@ export const MOST = 2;
 const ease = (t) => t * t * (3 - 2 * t);
 const still = matchMedia("(prefers-reduced-motion: reduce)");
 
-/// First camera: the photo nearest to the middle of all, upright, and so that it fills the picture;
-/// for a scene without photos from outside.
-export function firstCamera(views, extent, up) {
-  if (!views.length) {
-    const camera = new Camera({ rotation: [1, 0, 0, 0, 1, 0, 0, 0, 1], position: [0, 0, 0], focal: 1.2 });
-    camera.frame(extent.centre, extent.radius);
-    return camera;
-  }
-  const all = views.map((v) => Camera.of(v, 1));
-  const middle = [0, 1, 2].map((k) => all.reduce((sum, c) => sum + c.position[k], 0) / all.length);
-  const off = (c) => Math.hypot(...sub(c.position, middle));
-  const camera = all.reduce((a, b) => (off(b) < off(a) ? b : a));
-  camera.cover = 1;
-  if (up) camera.straighten(up);
-  return camera;
-}
-
 export class Motion {
   /// `home` is the first camera, `views` are those of photos, `closest` is the least distance to
   /// a surface. Callbacks: `aim` sets the pivot of a camera, `moved` follows every change, `shown`
@@ -49,11 +32,17 @@ export class Motion {
     this.insetTo = [0, 0];
     this.swayAt = still.matches ? null : Infinity;
     this.onScreen = false;
+    this.used = false;
     this.stirredAt = this.last = -1e9;
   }
 
   get #sways() {
     return this.swayAt !== null && this.onScreen;
+  }
+
+  /// Whether nobody has moved the camera yet.
+  get untouched() {
+    return !this.used && this.flight === null;
   }
 
   /// Whether the picture moves or moved just now.
@@ -80,6 +69,7 @@ export class Motion {
   }
 
   stop() {
+    this.used = true;
     this.rest();
     this.flight = null;
     this.playing(false);

@@ -1,0 +1,176 @@
+// Drawing of the scene: order of the splats, frames in motion and at rest, pictures, and the
+// surface at a position.
+import { Camera } from "splatvk/camera";
+import { MOST, Pace } from "splatvk/motion";
+import { pick } from "splatvk/pick";
+import { Renderer } from "splatvk/render";
+import { canvas, levels, scene, state, views } from "splatvk/page";
+import { extentOf } from "splatvk/splats";
+
+const STALE = 0, ROUGH = 1, SHARP = 2;
+let worker, next = null, request = 0, sortedFor = -1, waiting = false, drawn = STALE, capturing = false;
+let last = 0, slowest = 0, wasRough = false;
+const idle = [], pace = new Pace(), overlays = [];
+/// Whether something waits to be drawn before the picture counts as settled.
+let pending = () => false;
+
+/// Adds a function that draws over each new picture: (camera, width, height in CSS pixels).
+export function overlay(drawOver) {
+  overlays.push(drawOver);
+}
+
+/// Begins with the splats of the scene; they appear once they are sorted.
+export function begin(splats) {
+  scene.splats = splats;
+  scene.extent = extentOf(splats);
+  scene.renderer = new Renderer(canvas, splats, levels);
+  const source = JSON.parse(document.querySelector("script[type=importmap]").textContent).imports["splatvk/sort"];
+  worker = new Worker(source);
+  worker.onmessage = ({ data }) => sorted(data);
+  worker.postMessage({ positions: splats.positions.slice() });
+}
+
+/// Draws from now on; `busy` says whether a tap waits for another.
+export function start(busy) {
+  pending = busy;
+  moved();
+  requestAnimationFrame(frame);
+}
+
+/// Shows other splats of the same scene from the present camera, once they are sorted.
+export function replace(splats) {
+  next = { splats, renderer: new Renderer(canvas, splats, levels), after: request };
+  worker.postMessage({ positions: splats.positions.slice() });
+  moved();
+}
+
+/// Takes a sorted order; one that was requested before the scene.splats changed belongs to the old ones.
+function sorted(data) {
+  waiting = false;
+  if (next && data.id > next.after) {
+    scene.renderer.free();
+    const { splats, renderer } = next;
+    Object.assign(scene, { splats, renderer, extent: extentOf(splats) });
+    next = null;
+  }
+  if (!next) {
+    scene.renderer.setOrder(data);
+    sortedFor = data.id;
+    drawn = STALE;
+  }
+  if (request !== sortedFor) sort();
+}
+
+/// Size of the picture in CSS pixels, or of one that is captured.
+export const size = () => (capturing ? [canvas.width, canvas.height] : [canvas.clientWidth, canvas.clientHeight]);
+
+function fit(width, height) {
+  if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+}
+
+function sort() {
+  if (waiting) return;
+  waiting = true;
+  const { camera } = scene.motion, [width, height] = size(), [fx, fy, cx, cy] = camera.intrinsics(width, height);
+  // Half an image more on every side, since splats reach beyond their centre.
+  const slope = [(Math.max(cx, width - cx) + width / 2) / fx, (Math.max(cy, height - cy) + height / 2) / fy];
+  worker.postMessage({ id: request, rotation: camera.rotation, translation: camera.translation, near: scene.near, slope });
+}
+
+/// Redraws after a change of the camera or of the size of the picture.
+export function moved() {
+  request++;
+  drawn = STALE;
+  sort();
+}
+
+export function changed() {
+  drawn = STALE;
+}
+
+/// Whether what no photo shows is in the picture.
+const showsGuessed = () => state.guessed || state.mode !== "colour";
+
+export function draw(camera, lean = false) {
+  const { mode, level, selected } = state;
+  scene.renderer.draw(camera, { mode, level, selecting: selected !== null, near: scene.near, guessed: showsGuessed() ? 1 : 0, lean });
+}
+
+function frame(now) {
+  requestAnimationFrame(frame);
+  if (capturing) return;
+  scene.motion.step(now);
+  // A frame that takes long delays one of the next calls, not always the very next.
+  slowest = Math.max(slowest, now - last);
+  last = now;
+  const rough = scene.motion.moving(now);
+  if (rough ? drawn === STALE : drawn !== SHARP && request === sortedFor) {
+    if (rough && wasRough) pace.note(slowest);
+    slowest = 0;
+    // Where frames are slow, a sharp picture is the better greeting.
+    if (pace.lean) scene.motion.rest();
+    overlays.forEach((drawOver) => drawOver(scene.motion.camera, ...size()));
+    const most = Math.min(devicePixelRatio || 1, MOST), density = rough ? Math.min(most, pace.density) : most;
+    fit(...size().map((v) => Math.max(1, Math.round(v * density))));
+    draw(scene.motion.camera, rough && pace.lean);
+    drawn = rough ? ROUGH : SHARP;
+    wasRough = rough;
+  }
+  if (drawn === SHARP && !rough && !pending()) idle.splice(0).forEach((tell) => tell());
+}
+
+/// Resolves when the picture shows the current state in full quality, splats in their final order.
+export function settled() {
+  scene.motion.rest();
+  return new Promise((tell) => idle.push(tell));
+}
+
+/// Returns the picture as a PNG blob; with the index of a photo, from its camera at its size.
+export async function picture(view) {
+  await settled();
+  const before = scene.motion.camera;
+  capturing = true;
+  try {
+    if (view !== undefined) {
+      scene.motion.camera = Camera.of(views[view], 1);
+      fit(views[view].width, views[view].height);
+      moved();
+      while (request !== sortedFor) await new Promise((go) => setTimeout(go, 5));
+    }
+    draw(scene.motion.camera);
+    return await new Promise((done) => canvas.toBlob(done));
+  } finally {
+    capturing = false;
+    scene.motion.camera = before;
+    moved();
+  }
+}
+
+/// Depth and codes at a position of the canvas, CSS pixels.
+export function hitAt(x, y) {
+  return pick(scene.splats, scene.motion.camera, x, y, ...size(), scene.near, state.mode === "unseen");
+}
+
+export const placeAt = (x, y, depth) => scene.motion.camera.unproject(x, y, depth, ...size());
+
+/// The point of the scene at a position; where nothing is, one at the distance of the pivot.
+export function surface(x, y) {
+  return placeAt(x, y, hitAt(x, y)?.depth ?? Math.max(scene.motion.camera.distance, 2 * scene.motion.closest));
+}
+
+/// Sets the pivot of a camera to the surface in the middle of its image.
+export function aimAt(which) {
+  const hit = pick(scene.splats, which, 320, 240, 640, 480, scene.near, false);
+  if (hit) which.distance = hit.depth;
+}
+
+/// Restores the graphics context, which phones take from pages in the background; `again` marks
+/// what was marked in the lost one.
+export function keepContext(again) {
+  canvas.addEventListener("webglcontextlost", (e) => e.preventDefault());
+  canvas.addEventListener("webglcontextrestored", () => {
+    scene.renderer = new Renderer(canvas, scene.splats, levels);
+    again();
+    moved();
+  });
+}

@@ -1,0 +1,100 @@
+// The first camera: level, and with the main things in the frame.
+import { Camera, add, cross, rotate, scale, sub, unit } from "splatvk/camera";
+import { find, levels, scene, views } from "splatvk/page";
+
+/// Shares of the splats of a thing of its own: below are crumbs, above is the ground with all on it.
+const CRUMB = 0.002, GROUND = 0.25;
+/// Least share of the splats that is taken for the main things.
+const FEW = 0.01;
+/// Margin around the things, as a share of the picture, and the least share of its usual size to
+/// which the photo is reduced for them.
+const MARGIN = 0.03, LEAST = 0.8;
+/// Angle from which a scene without photos is seen from above, radians.
+const PITCH = Math.PI / 9;
+
+/// First camera: the photo nearest to the middle of all, without roll; for a scene without photos
+/// from outside, a little from above.
+export function firstCamera(photos, extent, up) {
+  if (!photos.length) return outside(extent, up);
+  const all = photos.map((v) => Camera.of(v, 1));
+  const middle = [0, 1, 2].map((k) => all.reduce((sum, c) => sum + c.position[k], 0) / all.length);
+  const off = (c) => Math.hypot(...sub(c.position, middle));
+  const camera = all.reduce((a, b) => (off(b) < off(a) ? b : a));
+  camera.cover = 1;
+  camera.straighten(up);
+  return camera;
+}
+
+function outside({ centre, radius }, up) {
+  // The axis nearest to +z that is level, since files of Gaussians are seen along +z.
+  const level = sub([0, 0, 1], scale(up, up[2]));
+  const ahead = Math.hypot(...level) > 0.1 ? unit(level) : unit(cross(up, [1, 0, 0]));
+  const forward = unit(add(scale(ahead, Math.cos(PITCH)), scale(up, -Math.sin(PITCH))));
+  const right = unit(cross(forward, up));
+  const camera = new Camera({ rotation: [...right, ...cross(forward, right), ...forward], position: [0, 0, 0], focal: 1.2 });
+  camera.frame(centre, radius);
+  return camera;
+}
+
+/// Sets how much of the photo a camera of [`firstCamera`] shows in a picture of this size, and where
+/// in it: as near as the main things fit into it between the controls.
+export function frameStart(camera, width, height) {
+  if (!views.length || !width || !height) return;
+  scene.subject ??= subjectOf(scene.splats);
+  // In units of the height of the photo, about its middle.
+  const box = boxOf(scene.subject, camera);
+  if (!box) return;
+  // On a low picture the controls would leave no room.
+  const bars = height > 420 ? [".v-top", ".v-bottom"].map((bar) => barOf(find(bar))) : [0, 0], free = [width, height - bars[0] - bars[1]];
+  const heights = [height, width / camera.ratio], [whole, filled] = [Math.min(...heights), Math.max(...heights)];
+  const room = [0, 1].map((k) => free[k] * (1 - 2 * MARGIN) / (box[1][k] - box[0][k]));
+  const unitLength = Math.min(Math.max(Math.min(...room), LEAST * whole), filled);
+  camera.cover = filled > 1.001 * whole ? Math.log(unitLength / whole) / Math.log(filled / whole) : 0;
+  // Into the middle of the free part, but no edge of the photo into a picture that it fills.
+  camera.shift = [0, 1].map((k) => {
+    const to = (k ? (bars[0] - bars[1]) / 2 : 0) / unitLength - (box[0][k] + box[1][k]) / 2;
+    const spare = ((k ? 1 : camera.ratio) - (k ? height : width) / unitLength) / 2;
+    return spare > 0 ? Math.min(spare, Math.max(-spare, to)) : to;
+  });
+}
+
+/// Height that a row of controls covers.
+const barOf = ({ offsetHeight }) => (offsetHeight ? offsetHeight + 16 : 0);
+
+/// Indices of the splats of the main things: those within half of the photos; where language knows things,
+/// those of things only.
+function subjectOf({ count, codes, positions, unseen }) {
+  const inside = (p) => views.filter((v) => {
+    const [x, y, z] = add(rotate(v.rotation, p), v.translation);
+    const [u, w] = [v.fx * x / z + v.cx, v.fy * y / z + v.cy];
+    return z > 0 && u > 0 && w > 0 && u < v.width && w < v.height;
+  }).length;
+  const seen = [];
+  for (let i = 0; i < count; i++) {
+    if (!unseen?.[i] && inside(positions.subarray(3 * i, 3 * i + 3)) >= 0.5 * views.length) seen.push(i);
+  }
+  const level = levels.findLastIndex((l) => l.colours.length);
+  if (level < 0 || !codes[level]) return { list: seen, things: false };
+  const sizes = levels[level].colours.map(() => 0), bearing = new Set(levels[level].standing.map(([on]) => on));
+  codes[level].forEach((code) => { if (code) sizes[code - 1]++; });
+  const isThing = (code) => code >= 0 && !bearing.has(code) && sizes[code] > CRUMB * count && sizes[code] < GROUND * count;
+  const things = seen.filter((i) => isThing(codes[level][i] - 1));
+  return things.length > FEW * count ? { list: things, things: true } : { list: seen, things: false };
+}
+
+/// Least and largest (x, y) of the splats of a camera, in units of the height of its photo, about
+/// the principal point; without the outermost.
+function boxOf({ list, things }, camera) {
+  const away = things ? 0.01 : 0.1, places = [];
+  for (const i of list) {
+    const [x, y, z] = rotate(camera.rotation, sub(scene.splats.positions.subarray(3 * i, 3 * i + 3), camera.position));
+    if (z > 0) places.push([camera.focal * camera.aspect * x / z, camera.focal * y / z]);
+  }
+  if (places.length < 10) return null;
+  const ends = [0, 1].map((k) => {
+    const sorted = Float32Array.from(places, (p) => p[k]).sort(), at = Math.floor(away * sorted.length);
+    return [sorted[at], sorted[sorted.length - 1 - at]];
+  });
+  const [x, y] = ends;
+  return x[1] > x[0] && y[1] > y[0] ? [[x[0], y[0]], [x[1], y[1]]] : null;
+}
