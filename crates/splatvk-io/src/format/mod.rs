@@ -18,6 +18,7 @@ pub mod scene_photos;
 pub mod side_file;
 pub mod transform;
 pub mod transforms;
+pub mod views;
 mod workspace;
 
 pub use camera_file::CameraFile;

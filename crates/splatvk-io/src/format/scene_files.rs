@@ -1,5 +1,5 @@
 //! Files of a scene directory that splatvk wrote: only these may be replaced.
-use super::{cameras, scene_dir};
+use super::{cameras, scene_dir, views};
 use crate::files;
 use crate::photo::stem;
 use crate::scene::LEVEL_NAMES;
@@ -53,6 +53,7 @@ impl Names {
             scene_dir::BACKDROP,
             scene_dir::HOLES,
             "run.json",
+            views::FILE,
             "report.html",
             "cameras/transforms.json",
             "cameras/photos.json",
