@@ -357,6 +357,7 @@ fn static_page_answers_stored_queries() {
         names: &names,
         answers: answers.iter().map(|a| a.shown()).collect(),
         suggested: Vec::new(),
+        named: Default::default(),
     };
     let (section, note) = view.embedded().unwrap();
     println!("{note}");

@@ -171,11 +171,25 @@ pub fn share(text: &str) -> Result<f64, String> {
     if (0.0..=1.0).contains(&value) { Ok(value) } else { Err("give a number from 0 to 1".to_owned()) }
 }
 
+/// Length of a film.
+fn seconds(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|v| (0.1..=600.0).contains(v));
+    value.ok_or_else(|| "give seconds, 0.1 to 600".to_owned())
+}
+
+/// Angle of an orbit.
+fn degrees(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|v| (1.0..=360.0).contains(v));
+    value.ok_or_else(|| "give degrees, 1 to 360".to_owned())
+}
+
 /// Views of `render --path`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum PathKind {
     /// The photos' cameras from left to right, with three views between neighbours
     Photos,
+    /// A level circle around the middle of the scene, or a swing where photos show one side only
+    Orbit,
     /// 10° and 20° to the left and right of the photos, 15° above and 10° below, nearer and further
     Beyond,
 }
@@ -214,16 +228,31 @@ pub struct RenderArgs {
     /// Scene directory, or a file of Gaussians (.ply, .splat, .spz, .sog, .glb, .gltf)
     pub scene: PathBuf,
     /// Cameras: transforms.json, a COLMAP model folder, or cameras.json
-    #[arg(long, value_name = "FILE", required_unless_present = "path", conflicts_with = "path")]
+    #[arg(long, value_name = "FILE", required_unless_present_any = ["path", "view"], conflicts_with = "path")]
     pub cameras: Option<PathBuf>,
+    /// A named view of the scene, saved in splatvk view; may be given more than once
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["cameras", "path"])]
+    pub view: Vec<String>,
+    /// Height of the picture of a named view, pixels
+    #[arg(long, value_name = "N", default_value_t = 720, requires = "view", value_parser = whole::<u32>(16..=8192))]
+    pub height: u32,
     /// Views along a path instead of given cameras, with a sheet of all, their opacity and colours
     #[arg(long, value_enum)]
     pub path: Option<PathKind>,
     /// Also a video along the path: path.mp4
     #[arg(long, requires = "path")]
     pub video: bool,
-    /// Folder for the images
-    #[arg(long, value_name = "DIR")]
+    /// Length of a film, seconds
+    #[arg(long, value_name = "S", default_value_t = 8.0, requires = "path", value_parser = seconds)]
+    pub seconds: f64,
+    /// Frames per second of a film
+    #[arg(long, value_name = "N", default_value_t = 30, requires = "path", value_parser = whole::<u32>(1..=120))]
+    pub fps: u32,
+    /// Angle of an orbit; 360 goes around [default: as far as the photos are around the scene]
+    #[arg(long, value_name = "D", requires = "path", value_parser = degrees)]
+    pub degrees: Option<f64>,
+    /// Folder for the images, or FILE.mp4 for a film along the path (needs ffmpeg)
+    #[arg(long, value_name = "DIR|FILE.mp4")]
     pub out: PathBuf,
     /// What to write
     #[arg(long, value_enum, value_delimiter = ',', default_value = "rgb")]
@@ -289,6 +318,12 @@ pub struct ViewArgs {
     /// Port on 127.0.0.1; 0 takes a free one
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = whole::<u16>(0..=65_535))]
     pub port: u16,
+    /// Most splats that the page shows: of more, those that cover most; the page states both numbers
+    #[arg(long, default_value_t = 1_000_000, value_name = "N", value_parser = whole::<usize>(1..=100_000_000))]
+    pub budget: usize,
+    /// Mesh of this scene to show over the splats (splatvk mesh SCENE FILE.glb)
+    #[arg(long, value_name = "FILE")]
+    pub mesh: Option<PathBuf>,
     /// Edits
     #[command(flatten)]
     pub edits: EditUse,

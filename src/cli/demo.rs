@@ -2,7 +2,7 @@
 use super::args::{DeviceArgs, EditUse};
 use super::print::{print, print_json};
 use super::progress;
-use super::view::Shown;
+use super::view::{Content, Shown};
 use crate::files;
 use crate::gpu;
 use crate::progress::Progress;
@@ -75,7 +75,15 @@ pub fn demo(args: &DemoArgs) -> Result<()> {
         };
         joined(finished)?;
         let queries = QUERIES.map(str::to_owned);
-        let shown = Shown::open((&scene, EditUse::default()), 0, &args.device, &queries)?;
+        let content = Content {
+            path: &scene,
+            edits: EditUse::default(),
+            device: &args.device,
+            suggested: &queries,
+            budget: usize::MAX,
+            mesh: None,
+        };
+        let shown = Shown::open(0, content)?;
         open_browser(&shown.url());
         shown.serve(false)?;
         joined(running)

@@ -57,6 +57,9 @@ pub struct ExportArgs {
     /// html: heading of the page [default: name of the scene]
     #[arg(long, value_name = "TEXT")]
     pub title: Option<String>,
+    /// html: named views and notes from another file than the scene's own views.json
+    #[arg(long, value_name = "FILE")]
+    pub views: Option<PathBuf>,
     /// Keep what no photo shows: surfaces continued beyond the photos and behind what stands in
     /// front, and the blurred colours behind the scene (html: the page has them, key G hides them)
     #[arg(long)]
@@ -182,6 +185,8 @@ pub fn write(args: &ExportArgs) -> Result<Exported> {
         page::check(args)?;
     } else if args.title.is_some() {
         return Err(Error::input("--title: only --format html has a heading; leave it out"));
+    } else if args.views.is_some() {
+        return Err(Error::input("--views: only --format html has named views; leave it out"));
     }
     let out = Output::reserve(args, format)?;
     let mut scene = scene::load(&args.scene, args.edits)?;

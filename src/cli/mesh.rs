@@ -185,6 +185,11 @@ fn figures(made: &SceneMesh, placed: &Mesh, placement: &Placement, world: &World
     let (low, high) = placed.extent().unwrap_or_default();
     let size = [0, 1, 2].map(|k| high[k] - low[k]);
     json!({
+        "from_scene": {
+            "scale": scale,
+            "rotation": placement.by.rotation.transpose().to_cols_array(),
+            "translation": placement.by.translation.to_array(),
+        },
         "unit": if placement.metric { "metre" } else { "scene unit" },
         "up": if args.raw { "as in the scene" } else if placement.upright { "y" } else { "unknown" },
         "up_sigma_degrees": up.map(|up| up.sigma_degrees),

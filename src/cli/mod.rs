@@ -10,6 +10,7 @@ mod edit;
 pub mod eval;
 mod export;
 mod fetch;
+mod film;
 mod kept;
 mod label;
 mod line;

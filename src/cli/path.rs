@@ -22,6 +22,8 @@ impl From<PathKind> for CameraPath {
         match kind {
             PathKind::Photos => CameraPath::Photos,
             PathKind::Beyond => CameraPath::Beyond,
+            // An orbit is a film (film.rs) and no views of this path.
+            PathKind::Orbit => CameraPath::Photos,
         }
     }
 }

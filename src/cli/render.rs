@@ -1,5 +1,6 @@
 //! `splatvk render`
 use super::args::{Channel, ImageFormat, RenderArgs};
+use super::film;
 use super::outputs::WrittenFiles;
 use super::path::PathOutput;
 use super::print::{listing, print, print_json};
@@ -8,25 +9,32 @@ use super::scene;
 use super::views;
 use crate::format::npy::{self, NpyArray};
 use crate::format::picture::{self, Planes};
+use crate::format::views::Views;
 use crate::gpu;
 use crate::photo::VideoWriter;
 use crate::report::colour;
 use crate::run::path::PathViews;
 use crate::run::view::{DecodedFrame, UnseenShare, Viewer};
-use crate::scene::{Image, LEVEL_NAMES, LanguageField, RgbImage, to_linear};
+use crate::scene::{Camera, Image, LEVEL_NAMES, LanguageField, RgbImage, to_linear};
 use crate::{Error, Result};
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
 pub fn render(args: &RenderArgs) -> Result<()> {
+    if film::is_wanted(args) {
+        return film::film(args);
+    }
     let inputs: Vec<&Path> =
         std::iter::once(&args.scene).chain(&args.cameras).map(PathBuf::as_path).collect();
     let mut out = WrittenFiles::open(&args.out, args.force, &inputs)?;
     if args.video {
-        VideoWriter::check()?;
+        VideoWriter::check("--video", "or leave the video out")?;
     }
     let scene = scene::load(&args.scene, args.edits)?;
-    let given = args.cameras.as_deref().map(views::read).transpose()?;
+    let given = match args.view.as_slice() {
+        [] => args.cameras.as_deref().map(views::read).transpose()?,
+        names => Some(named(&args.scene, names, args.height)?),
+    };
     let wants_language = args.channels.iter().any(|c| matches!(c, Channel::Features | Channel::Codes));
     if wants_language && scene.language.is_none() {
         return Err(Error::input(format!(
@@ -99,6 +107,12 @@ pub fn render(args: &RenderArgs) -> Result<()> {
     }
     print(&path.table())?;
     listing(&files, false)
+}
+
+/// Cameras of named views of a scene.
+fn named(scene: &Path, names: &[String], height: u32) -> Result<Vec<Camera>> {
+    let views = Views::of_scene(scene)?;
+    names.iter().map(|name| Ok(views.named(name)?.camera(height))).collect()
 }
 
 /// Output of one camera.

@@ -5,6 +5,7 @@
 //! other users, requests that never end. All connections share one thread that blocks on none of
 //! them, so that none delays another.
 use crate::error::words;
+use crate::format::views::Views;
 use crate::sync::lock;
 use crate::{Error, Result};
 use http_body_util::{BodyExt, Full, LengthLimitError, Limited};
@@ -17,6 +18,7 @@ use serde_json::{Value, json};
 use std::collections::VecDeque;
 use std::convert::Infallible;
 use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -28,6 +30,8 @@ use tokio::time::{sleep, timeout};
 
 /// Maximum size of a request body, bytes: a question is a few words.
 const MAX_BODY: usize = 4096;
+/// Maximum size of views and notes, bytes: as many as a file may hold fit.
+const MAX_VIEWS: usize = 512 << 10;
 /// Maximum size of a request head, bytes; browsers send one or two thousand.
 const MAX_HEAD: usize = 32 << 10;
 /// Time limit for a request to arrive, head and body each. On one machine it takes milliseconds.
@@ -44,6 +48,9 @@ const REFUSED: Duration = Duration::from_millis(50);
 /// Policy of the page: it runs its own scripts, connects to its own server, and nothing else.
 const CONTENT_SECURITY_POLICY: &str = "default-src 'none'; script-src 'unsafe-inline' data:; worker-src data:; style-src 'unsafe-inline'; \
                       img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
+
+/// Type of most answers.
+const JSON: &str = "application/json";
 
 /// A JSON text, or status and message of a refusal.
 pub type Answer = Result<String, (u16, String)>;
@@ -68,6 +75,10 @@ pub struct Site {
     pub answers_questions: bool,
     /// Whether another page will follow.
     pub is_preview: bool,
+    /// Scene directory whose views and notes the page may save.
+    pub views: Option<PathBuf>,
+    /// GLB file of a mesh of the scene.
+    pub mesh: Option<Vec<u8>>,
 }
 
 /// The site of a running server.
@@ -196,6 +207,8 @@ struct Content {
     scene: Bytes,
     answers_questions: bool,
     is_preview: bool,
+    views: Option<PathBuf>,
+    mesh: Option<Bytes>,
     /// Numbers of the page, and of the scene of that page.
     numbers: (u64, u64),
     notice: String,
@@ -209,6 +222,8 @@ impl Content {
             scene: site.scene.into(),
             answers_questions: site.answers_questions,
             is_preview: site.is_preview,
+            views: site.views,
+            mesh: site.mesh.map(Bytes::from),
             numbers: (0, 0),
             notice: String::new(),
         }
@@ -223,8 +238,9 @@ impl Content {
                 let state = json!({
                     "page": page, "preview": self.is_preview, "scene": scene, "notice": self.notice,
                 });
-                Some(("application/json", state.to_string().into()))
+                Some((JSON, state.to_string().into()))
             }
+            "mesh.glb" => Some(("model/gltf-binary", self.mesh.clone()?)),
             name if name == self.scene_path => Some(("application/octet-stream", self.scene.clone())),
             _ => None,
         }
@@ -252,9 +268,7 @@ impl Shared {
     async fn respond(&self, request: Request<Incoming>, waits: &AtomicBool) -> Response<Full<Bytes>> {
         let (status, kind, body) = match self.answer(request, waits).await {
             Ok((kind, body)) => (StatusCode::OK, kind, body),
-            Err((status, message)) => {
-                (status, "application/json", Bytes::from(json!({ "error": message }).to_string()))
-            }
+            Err((status, message)) => (status, JSON, Bytes::from(json!({ "error": message }).to_string())),
         };
         // Hyper omits the body of an answer to HEAD, and keeps its length.
         let mut response = Response::new(Full::new(body));
@@ -283,13 +297,18 @@ impl Shared {
         let not_found = || (StatusCode::NOT_FOUND, "there is nothing here".to_owned());
         let name = self.path_after_secret(request.uri().path()).ok_or_else(not_found)?.to_owned();
         match (request.method(), name.as_str()) {
+            (&Method::GET, "views") => self.views().map(|views| (JSON, views.into())),
+            (&Method::POST, "views") => {
+                let text = body(request, MAX_VIEWS, "views and notes", "delete some").await?;
+                self.save(&text).map(|views| (JSON, views.into()))
+            }
             (&Method::GET | &Method::HEAD, name) => lock(&self.content).get(name).ok_or_else(not_found),
             (&Method::POST, "query") => {
                 let text = question(request).await?;
                 waits.store(true, Ordering::Relaxed);
                 let answer = self.ask(text).await;
                 waits.store(false, Ordering::Relaxed);
-                Ok(("application/json", answer?.into()))
+                Ok((JSON, answer?.into()))
             }
             _ => Err(not_found()),
         }
@@ -312,6 +331,28 @@ impl Shared {
             .is_none_or(|o| o.and_then(|o| o.strip_prefix("http://")).is_some_and(is_known));
         let authority = request.uri().authority().is_none_or(|a| is_known(a.as_str()));
         host && origin && authority
+    }
+
+    /// Scene directory of the views; refuses a page that has none.
+    fn views_folder(&self) -> Result<PathBuf, Refused> {
+        let folder = lock(&self.content).views.clone();
+        folder
+            .ok_or_else(|| (StatusCode::NOT_FOUND, "this scene has no place for views and notes".to_owned()))
+    }
+
+    /// Views and notes as they are in the scene now.
+    fn views(&self) -> Result<String, Refused> {
+        let failed = |e: Error| (StatusCode::INTERNAL_SERVER_ERROR, e.to_string());
+        Ok(json!(Views::of_scene(&self.views_folder()?).map_err(failed)?).to_string())
+    }
+
+    /// Replaces the views and notes of the scene. A file is written in a moment, so that other
+    /// requests can wait for it.
+    fn save(&self, text: &[u8]) -> Result<String, Refused> {
+        let folder = self.views_folder()?;
+        let views = Views::parse(text).map_err(|e| (StatusCode::UNPROCESSABLE_ENTITY, e))?;
+        views.write(&folder).map_err(|e| (StatusCode::INTERNAL_SERVER_ERROR, e.to_string()))?;
+        Ok(json!(views).to_string())
     }
 
     async fn ask(&self, text: String) -> Result<String, Refused> {
@@ -338,21 +379,32 @@ fn single_value<'h>(headers: &'h HeaderMap, name: &HeaderName) -> Option<Option<
 }
 
 async fn question(request: Request<Incoming>) -> Result<String, Refused> {
-    let too_long =
-        || (StatusCode::PAYLOAD_TOO_LARGE, format!("a question has at most {MAX_BODY} bytes; ask shorter"));
-    let body = request.into_body();
-    // Checked before the first byte is read.
-    if body.size_hint().lower() > MAX_BODY as u64 {
-        return Err(too_long());
-    }
+    let whole = body(request, MAX_BODY, "a question", "ask shorter").await?;
     let malformed = || (StatusCode::BAD_REQUEST, "ask as {\"text\": \"a few words\"}".to_owned());
-    let whole = timeout(ARRIVAL, Limited::new(body, MAX_BODY).collect())
-        .await
-        .map_err(|_| (StatusCode::REQUEST_TIMEOUT, "the question did not arrive".to_owned()))?
-        .map_err(|e| if e.is::<LengthLimitError>() { too_long() } else { malformed() })?;
-    let value: Value = serde_json::from_slice(&whole.to_bytes()).map_err(|_| malformed())?;
+    let value: Value = serde_json::from_slice(&whole).map_err(|_| malformed())?;
     let text = value["text"].as_str().unwrap_or_default().trim();
     if text.is_empty() { Err(malformed()) } else { Ok(text.to_owned()) }
+}
+
+/// Body of a request of at most `most` bytes; `name` and `advice` are for the refusals.
+async fn body(request: Request<Incoming>, most: usize, name: &str, advice: &str) -> Result<Bytes, Refused> {
+    let too_long = || {
+        let limit = format!("the limit of {name} is {most} bytes; {advice}");
+        (StatusCode::PAYLOAD_TOO_LARGE, limit)
+    };
+    let body = request.into_body();
+    // Checked before the first byte is read.
+    if body.size_hint().lower() > most as u64 {
+        return Err(too_long());
+    }
+    let whole = timeout(ARRIVAL, Limited::new(body, most).collect())
+        .await
+        .map_err(|_| (StatusCode::REQUEST_TIMEOUT, format!("{name}: the request did not arrive")))?
+        .map_err(|e| match e.is::<LengthLimitError>() {
+            true => too_long(),
+            false => (StatusCode::BAD_REQUEST, format!("{name}: the request is damaged")),
+        })?;
+    Ok(whole.to_bytes())
 }
 
 #[cfg(test)]

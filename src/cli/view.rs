@@ -7,13 +7,13 @@ use super::serve::{Answer, ServerAddress, Site, serve};
 use crate::format::scene_dir::Scene;
 use crate::gpu;
 use crate::query::QueryOptions;
-use crate::report::viewer::{self, CodeNames, Lifetime, SCENE_PATH, Scene3d};
+use crate::report::viewer::{self, CodeNames, Lifetime, Packed, SCENE_PATH, Scene3d, Served};
 use crate::run::Compat;
 use crate::run::ask::QueryScene;
 use crate::run::encoder;
 use crate::run::preview;
 use crate::run::record;
-use crate::{Error, Result};
+use crate::{Error, Result, files};
 use serde_json::json;
 use std::path::Path;
 use std::sync::mpsc::RecvTimeoutError;
@@ -25,17 +25,32 @@ const POLL_INTERVAL: Duration = Duration::from_millis(100);
 const LOOK_INTERVAL: Duration = Duration::from_secs(1);
 
 pub fn view(args: &ViewArgs) -> Result<()> {
-    let ViewArgs { scene, port, edits, device } = args;
-    Shown::open((scene, *edits), *port, device, &[])?.serve(device.json)
+    let ViewArgs { scene, port, budget, mesh, edits, device } = args;
+    let (budget, mesh) = (*budget, mesh.as_deref());
+    let content = Content { path: scene, edits: *edits, device, suggested: &[], budget, mesh };
+    Shown::open(*port, content)?.serve(device.json)
+}
+
+/// What a page is made of.
+#[derive(Clone, Copy)]
+pub struct Content<'a> {
+    /// The scene.
+    pub path: &'a Path,
+    /// Use of its edits.
+    pub edits: EditUse,
+    /// Device and models for questions.
+    pub device: &'a DeviceArgs,
+    /// Queries that the page offers.
+    pub suggested: &'a [String],
+    /// Most splats of the page.
+    pub budget: usize,
+    /// Mesh of the scene.
+    pub mesh: Option<&'a Path>,
 }
 
 /// A scene that is prepared to be served.
 pub struct Shown<'a> {
-    path: &'a Path,
-    edits: EditUse,
-    device: &'a DeviceArgs,
-    /// Queries that the page offers.
-    suggested: &'a [String],
+    content: Content<'a>,
     server: ServerAddress,
     /// Time stamp of the scene that a run is to replace.
     before: Option<SystemTime>,
@@ -55,17 +70,12 @@ impl<'a> Shown<'a> {
     ///
     /// # Errors
     /// A port that is in use, and a scene that cannot be read or has no splats.
-    pub fn open(
-        (path, edits): (&'a Path, EditUse),
-        port: u16,
-        device: &'a DeviceArgs,
-        suggested: &'a [String],
-    ) -> Result<Self> {
+    pub fn open(port: u16, content: Content<'a>) -> Result<Self> {
         // The port is bound first: one that is in use is reported before the scene is prepared.
         let server = ServerAddress::bind(port)?;
-        let before = written(path);
-        let prepared = Prepared::load((path, edits), device, suggested)?;
-        Ok(Shown { path, edits, device, suggested, server, before, prepared })
+        let before = written(content.path);
+        let prepared = Prepared::load(content)?;
+        Ok(Shown { content, server, before, prepared })
     }
 
     /// Address of the page.
@@ -75,7 +85,8 @@ impl<'a> Shown<'a> {
 
     /// Serves until the user or the parent process ends it.
     pub fn serve(self, as_json: bool) -> Result<()> {
-        let Shown { path, edits, device, suggested, server, before, prepared } = self;
+        let Shown { content, server, before, prepared } = self;
+        let path = content.path;
         let Prepared { site, mut ready, mut preview } = prepared;
         let options = Compat::answers(None, path)?;
         let (address, answers) = (server.url(), site.answers_questions);
@@ -111,16 +122,16 @@ impl<'a> Shown<'a> {
                 Some(stamp) if Some(stamp) == preview => {}
                 Some(stamp) => {
                     // A preview that is replaced at this moment comes with the next look.
-                    let packed =
-                        preview::of_running(path).map(|p| scene::load(&p, edits).and_then(|s| pack(&s)));
+                    let packed = preview::of_running(path)
+                        .map(|p| scene::load(&p, content.edits).and_then(|s| pack(&s, content.budget)));
                     if let Some(Ok(packed)) = packed {
-                        live.renew(packed);
+                        live.renew(packed.bytes);
                         preview = Some(stamp);
                     }
                 }
                 // The run is over; without a new scene the preview stays.
                 None if written(path).is_some_and(|time| Some(time) != before) => {
-                    let last = Prepared::load((path, edits), device, suggested)?;
+                    let last = Prepared::load(content)?;
                     live.replace(last.site);
                     (ready, preview) = (last.ready, last.preview);
                 }
@@ -142,7 +153,9 @@ fn written(scene: &Path) -> Option<SystemTime> {
 }
 
 impl Prepared {
-    fn load((path, edits): (&Path, EditUse), device: &DeviceArgs, suggested: &[String]) -> Result<Prepared> {
+    fn load(content: Content) -> Result<Prepared> {
+        let Content { path, edits, device, suggested, budget, mesh } = content;
+        let mesh = mesh.map(read_mesh).transpose()?;
         let preview = stamp(path);
         // The run may end at this moment and take its preview away.
         let running = preview.and_then(|_| scene::load(&preview::of_running(path)?, edits).ok());
@@ -165,14 +178,24 @@ impl Prepared {
             Some(_) if suggested.is_empty() => queries_of_run(path),
             Some(_) => suggested.to_vec(),
         };
-        let lifetime = if preview.is_some() { Lifetime::Preview } else { Lifetime::Final };
-        let page = page(&scene, path, &names, suggested, (no_questions.as_deref(), lifetime))?;
+        let packed = pack(&scene, budget)?;
+        let views = (preview.is_none() && path.is_dir()).then(|| path.to_owned());
+        let served = Served {
+            no_questions: no_questions.as_deref(),
+            lifetime: if preview.is_some() { Lifetime::Preview } else { Lifetime::Final },
+            shown: packed.shown,
+            total: packed.total,
+            saves_views: views.is_some(),
+            has_mesh: mesh.is_some(),
+        };
         let site = Site {
-            page,
+            page: page(&scene, path, &names, suggested, &served)?,
             scene_path: SCENE_PATH,
-            scene: pack(&scene)?,
+            scene: packed.bytes,
             answers_questions: ready.is_some(),
             is_preview: preview.is_some(),
+            views,
+            mesh,
         };
         Ok(Prepared { site, ready, preview })
     }
@@ -183,9 +206,20 @@ fn queries_of_run(scene: &Path) -> Vec<String> {
     record::read(scene, "").map(|record| record.config.plan.inputs.queries).unwrap_or_default()
 }
 
-fn pack(scene: &Scene) -> Result<Vec<u8>> {
-    let language = scene.language.as_ref();
-    Ok(viewer::pack(&scene.splats, &scene.seen, &scene.backdrop, language, usize::MAX)?.bytes)
+fn pack(scene: &Scene, budget: usize) -> Result<Packed> {
+    viewer::pack(&scene.splats, &scene.seen, &scene.backdrop, scene.language.as_ref(), budget)
+}
+
+/// Bytes of a GLB file, which the page reads.
+fn read_mesh(path: &Path) -> Result<Vec<u8>> {
+    let bytes = files::read(path)?;
+    if bytes.starts_with(b"glTF") {
+        return Ok(bytes);
+    }
+    Err(Error::input(format!(
+        "--mesh {}: is no .glb file; make one: splatvk mesh SCENE FILE.glb",
+        path.display()
+    )))
 }
 
 /// Prepares the scene for questions in its own views.
@@ -203,11 +237,11 @@ fn page(
     path: &Path,
     names: &CodeNames,
     suggested: Vec<String>,
-    (no_questions, lifetime): (Option<&str>, Lifetime),
+    served: &Served,
 ) -> Result<String> {
     let (images, title) = (scene::photos(scene), scene::title(path));
     let view = Scene3d { suggested, ..Scene3d::of(scene, &title, &images, names) };
-    view.served(no_questions, lifetime)
+    view.served(served)
 }
 
 fn reply(ready: Option<&mut QueryScene>, text: &str, options: &QueryOptions) -> Answer {

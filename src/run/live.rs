@@ -10,6 +10,7 @@ use super::{encoder, sources};
 use crate::files::check_spared;
 use crate::format::gaussians::{Reserved, WriteOptions};
 use crate::format::scene_dir::{self, Contents, Scene};
+use crate::format::views::Views;
 use crate::format::{Workspace, colmap, gaussians, scene_photos};
 use crate::gpu::Device;
 use crate::infer::Registry;
@@ -232,6 +233,7 @@ impl LiveScene {
             names,
             answers: Vec::new(),
             suggested: Vec::new(),
+            named: Views::default(),
         };
         scene.framed(most, asks)
     }

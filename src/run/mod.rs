@@ -21,6 +21,7 @@ pub mod method;
 pub mod metric;
 mod networks;
 pub mod objects;
+pub mod orbit;
 mod outcome;
 pub mod paper;
 pub mod path;

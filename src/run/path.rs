@@ -58,6 +58,11 @@ impl PathViews {
         Ok(PathViews { orbit: CameraOrbit::new(&named, target, up.normalize_or(-DVec3::Y)), photos })
     }
 
+    /// The point that the photos look at, and the unit vector up.
+    pub fn middle(&self) -> (DVec3, DVec3) {
+        (self.orbit.target(), self.orbit.up())
+    }
+
     /// The views of a path.
     pub fn cameras(&self, path: CameraPath) -> Vec<Camera> {
         match path {

@@ -4,6 +4,7 @@ use super::outcome::RunOutcome;
 use super::record::{curves, run_record};
 use crate::Result;
 use crate::fit::ViewDependence;
+use crate::format::views::Views;
 use crate::infer::words;
 use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
@@ -302,6 +303,7 @@ fn scene<'a>(title: &'a str, photos: &'a [RgbImage], o: &'a RunOutcome) -> Scene
         names: o.language.as_ref().map_or(&NO_NAMES, |l| &l.names),
         answers: o.language.iter().flat_map(|l| &l.answers).map(Answers::shown).collect(),
         suggested: Vec::new(),
+        named: Views::default(),
     }
 }
 

@@ -3,6 +3,7 @@ use super::{ExportArgs, Exported};
 use crate::cli::outputs::WrittenFile;
 use crate::cli::scene;
 use crate::format::scene_dir::Scene;
+use crate::format::views::Views;
 use crate::report::thousands;
 use crate::report::viewer::{CodeNames, Scene3d};
 use crate::{Error, Result};
@@ -27,7 +28,11 @@ pub(super) fn write(args: &ExportArgs, scene: &Scene, file: WrittenFile) -> Resu
     let images = scene::photos(scene);
     let title = args.title.clone().unwrap_or_else(|| scene::title(&args.scene));
     let names = CodeNames::new();
-    let view = Scene3d::of(scene, &title, &images, &names);
+    let named = match &args.views {
+        Some(file) => Views::read(file)?,
+        None => Views::of_scene(&args.scene)?,
+    };
+    let view = Scene3d { named, ..Scene3d::of(scene, &title, &images, &names) };
     let page = view.presented()?;
     file.keep(|path| std::fs::write(path, &page.html).map_err(Error::unwritable(path)))?;
     let up = scene.world.up.as_ref();

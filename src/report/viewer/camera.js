@@ -24,7 +24,7 @@ function about([x, y, z], angle) {
     z * x * d - y * s, z * y * d + x * s, c + z * z * d];
 }
 
-function toQuaternion(r) {
+export function toQuaternion(r) {
   const [xx, yy, zz] = [r[0], r[4], r[8]];
   const q = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz];
   const k = q.indexOf(Math.max(...q));
@@ -35,7 +35,7 @@ function toQuaternion(r) {
   return rows[k].map((v) => v / (2 * s));
 }
 
-function fromQuaternion([w, x, y, z]) {
+export function fromQuaternion([w, x, y, z]) {
   return [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
     2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
     2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)];
@@ -136,6 +136,14 @@ export class Camera {
     const by = factor < 1 ? Math.max(factor, Math.min(1, closest / this.distance)) : factor;
     this.position = add(point, scale(sub(this.position, point), by));
     this.distance *= by;
+  }
+
+  /// Turns towards a point, without roll.
+  face(point, up) {
+    const forward = unit(sub(point, this.position)), right = unit(cross(forward, up));
+    if (Math.abs(dot(forward, up)) > 0.99) return;
+    this.rotation = [...right, ...cross(forward, right), ...forward];
+    this.aim(point);
   }
 
   /// Sets the depth of a point as the distance of the pivot, without rotation.

@@ -114,7 +114,7 @@ function keys(view, zoomAt) {
   const table = {
     "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
     r: actions.reset, home: actions.reset, 0: actions.all, m: () => view.nextMode(1), g: view.toggleGuessed,
-    l: actions.measure, p: actions.save, f: actions.full, "?": actions.help, h: actions.help,
+    l: actions.measure, p: actions.save, v: actions.views, t: actions.mesh, f: actions.full, "?": actions.help, h: actions.help,
     "/": () => root.querySelector(".v-ask input").focus(), escape: view.clear,
   };
   root.addEventListener("keydown", (e) => {

@@ -12,6 +12,7 @@ use super::{colour, thousands};
 use crate::Result;
 use crate::format::picture;
 use crate::format::scene_dir::Scene;
+use crate::format::views::Views;
 use crate::query::clicks::Standing;
 use crate::query::highlight::Highlight;
 use crate::query::presence::Presence;
@@ -30,15 +31,18 @@ const REPORT_SPLATS: usize = 300_000;
 const THUMBNAIL: usize = 104;
 
 /// Import name and text of each module.
-const MODULES: [(&str, &str); 19] = [
+const MODULES: [(&str, &str); 23] = [
+    ("splatvk/address", include_str!("address.js")),
     ("splatvk/camera", include_str!("camera.js")),
     ("splatvk/card", include_str!("card.js")),
     ("splatvk/controls", include_str!("controls.js")),
     ("splatvk/frame", include_str!("frame.js")),
     ("splatvk/measure", include_str!("measure.js")),
+    ("splatvk/mesh", include_str!("mesh.js")),
     ("splatvk/motion", include_str!("motion.js")),
     ("splatvk/names", include_str!("names.js")),
     ("splatvk/page", include_str!("page.js")),
+    ("splatvk/panel", include_str!("panel.js")),
     ("splatvk/pick", include_str!("pick.js")),
     ("splatvk/preview", include_str!("preview.js")),
     ("splatvk/queries", include_str!("queries.js")),
@@ -49,6 +53,7 @@ const MODULES: [(&str, &str); 19] = [
     ("splatvk/stage", include_str!("stage.js")),
     ("splatvk/start", include_str!("start.js")),
     ("splatvk/things", include_str!("things.js")),
+    ("splatvk/views", include_str!("views.js")),
     ("splatvk/viewer", include_str!("viewer.js")),
 ];
 
@@ -119,6 +124,8 @@ pub struct Scene3d<'a> {
     pub answers: Vec<ShownAnswer<'a>>,
     /// Queries to choose from.
     pub suggested: Vec<String>,
+    /// Named views and notes of a page without a server.
+    pub named: Views,
 }
 
 impl<'a> Scene3d<'a> {
@@ -136,6 +143,7 @@ impl<'a> Scene3d<'a> {
             names,
             answers: Vec::new(),
             suggested: Vec::new(),
+            named: Views::default(),
         }
     }
 }
@@ -149,6 +157,23 @@ pub struct Presented {
     pub shown: usize,
     /// Number of splats of the scene, those behind it included.
     pub total: usize,
+}
+
+/// What a served page is told of its server.
+#[derive(Clone, Copy, Debug)]
+pub struct Served<'a> {
+    /// Reason why questions are not answered, if they are not.
+    pub no_questions: Option<&'a str>,
+    /// Whether splats or page change while it is open.
+    pub lifetime: Lifetime,
+    /// Number of splats that it sends.
+    pub shown: usize,
+    /// Number of splats of the scene, those behind it included.
+    pub total: usize,
+    /// Whether `GET views` sends the views and notes of the scene and `POST views` saves them.
+    pub saves_views: bool,
+    /// Whether `GET mesh.glb` sends a mesh of the scene.
+    pub has_mesh: bool,
 }
 
 /// Content of a served page that may change while it is open.
@@ -207,13 +232,17 @@ impl Scene3d<'_> {
         Ok(self.whole_page(&manifest, &splats))
     }
 
-    /// Whole page of a server that answers `POST query` and sends [`SCENE_PATH`]; `no_questions` is
-    /// the reason why it cannot answer, if any. A preview follows `GET state`.
-    pub fn served(&self, no_questions: Option<&str>, lifetime: Lifetime) -> Result<String> {
-        let mut manifest = self.manifest(no_questions.unwrap_or_default())?;
-        manifest["live"] = no_questions.is_none().into();
+    /// Whole page of a server that answers `POST query` and sends [`SCENE_PATH`]. A preview follows
+    /// `GET state`.
+    pub fn served(&self, server: &Served) -> Result<String> {
+        let mut manifest = self.manifest(server.no_questions.unwrap_or_default())?;
+        manifest["live"] = server.no_questions.is_none().into();
         manifest["scene"] = SCENE_PATH.into();
-        manifest["renews"] = (lifetime == Lifetime::Preview).into();
+        manifest["renews"] = (server.lifetime == Lifetime::Preview).into();
+        manifest["shown"] = server.shown.into();
+        manifest["total"] = server.total.into();
+        manifest["saves"] = server.saves_views.into();
+        manifest["mesh"] = server.has_mesh.into();
         Ok(self.whole_page(&manifest, ""))
     }
 
@@ -240,7 +269,7 @@ impl Scene3d<'_> {
             "metres": self.world.scale.as_ref().map(|s| s.metres_per_unit),
             "up": self.world.up.as_ref().map(|u| u.direction.to_array()),
             "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at, &standing)).collect::<Vec<_>>(),
-            "suggested": self.suggested,
+            "suggested": self.suggested, "named": self.named,
             "answers": self.answers.iter().map(ShownAnswer::json).collect::<Vec<_>>(),
         }))
     }
@@ -331,6 +360,7 @@ mod tests {
             names: &Vec::new(),
             answers: vec![answer],
             suggested: vec!["mug".into()],
+            named: Views::default(),
         };
         let (html, note) = scene.embedded().unwrap();
         assert!(note.contains(" splats, "), "{note}");
@@ -344,7 +374,15 @@ mod tests {
         let forward = camera.pose.rotation.row(2);
         assert_eq!(manifest["views"][0]["rotation"][8], forward.z);
         assert_eq!(manifest["views"][0]["rotation"][6], forward.x);
-        let page = scene.served(Some("no model"), Lifetime::Preview).unwrap();
+        let server = Served {
+            no_questions: Some("no model"),
+            lifetime: Lifetime::Preview,
+            shown: 40,
+            total: 50,
+            saves_views: false,
+            has_mesh: false,
+        };
+        let page = scene.served(&server).unwrap();
         assert!(page.contains("viewer full") && page.contains("a&lt;b") && !page.contains("v-splats\""));
         assert!(page.contains("\"ask_note\":\"no model\"") && page.contains("\"live\":false"));
         assert!(page.contains("\"renews\":true") && page.contains("\"suggested\":[\"mug\"]"));
@@ -353,8 +391,10 @@ mod tests {
         let shown = scene.presented().unwrap();
         assert!(shown.html.contains("<h1>a&lt;b</h1><p>") && shown.html.contains("\"presented\":true"));
         assert!(shown.shown > 0 && shown.shown <= shown.total && shown.total == splats.len());
-        let last = scene.served(None, Lifetime::Final).unwrap();
+        let last = Served { no_questions: None, lifetime: Lifetime::Final, saves_views: true, ..server };
+        let last = scene.served(&last).unwrap();
         assert!(last.contains("\"live\":true") && last.contains("\"renews\":false"));
+        assert!(last.contains("\"saves\":true") && last.contains("\"total\":50"));
         // Every imported module exists.
         for (_, text) in MODULES {
             for line in text.lines().filter(|l| l.starts_with("import ")) {

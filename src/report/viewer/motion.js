@@ -101,6 +101,13 @@ export class Motion {
     this.goTo(to, index, jump);
   }
 
+  /// Turns towards a point.
+  lookAt(point) {
+    const to = this.camera.copy();
+    to.face(point, this.up);
+    this.goTo(to, -1);
+  }
+
   /// Moves through the cameras of all photos in a loop, from the present camera; again, it stops.
   play() {
     if (this.flight || !this.views.length) return this.stop();

@@ -204,7 +204,8 @@ void main() {
   }
 }`;
 
-function program(gl, vertex, fragment) {
+/// Compiles a program; returns it with the locations of its uniforms.
+export function program(gl, vertex, fragment) {
   const made = gl.createProgram();
   for (const [type, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(type);
@@ -226,8 +227,8 @@ function program(gl, vertex, fragment) {
 }
 
 export class Renderer {
-  constructor(canvas, splats, levels) {
-    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: false, powerPreference: "high-performance" });
+  constructor(canvas, splats, levels, needsDepth = false) {
+    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false, depth: needsDepth, powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser offers no WebGL 2");
     this.gl = gl;
     // Without half floats the image is blended in bytes, with visible steps.

@@ -4,7 +4,7 @@ import { Camera } from "splatvk/camera";
 import { MOST, Pace } from "splatvk/motion";
 import { pick } from "splatvk/pick";
 import { Renderer } from "splatvk/render";
-import { canvas, levels, scene, state, views } from "splatvk/page";
+import { canvas, levels, manifest, scene, state, views } from "splatvk/page";
 import { extentOf } from "splatvk/splats";
 
 const STALE = 0, ROUGH = 1, SHARP = 2;
@@ -14,7 +14,8 @@ const idle = [], pace = new Pace(), overlays = [];
 /// Whether something waits to be drawn before the picture counts as settled.
 let pending = () => false;
 
-/// Adds a function that draws over each new picture: (camera, width, height in CSS pixels).
+/// Adds a function that draws over each new picture: (camera, width, height in CSS
+/// pixels, whether it is in full quality).
 export function overlay(drawOver) {
   overlays.push(drawOver);
 }
@@ -23,7 +24,7 @@ export function overlay(drawOver) {
 export function begin(splats) {
   scene.splats = splats;
   scene.extent = extentOf(splats);
-  scene.renderer = new Renderer(canvas, splats, levels);
+  scene.renderer = new Renderer(canvas, splats, levels, Boolean(manifest.mesh));
   const source = JSON.parse(document.querySelector("script[type=importmap]").textContent).imports["splatvk/sort"];
   worker = new Worker(source);
   worker.onmessage = ({ data }) => sorted(data);
@@ -39,7 +40,7 @@ export function start(busy) {
 
 /// Shows other splats of the same scene from the present camera, once they are sorted.
 export function replace(splats) {
-  next = { splats, renderer: new Renderer(canvas, splats, levels), after: request };
+  next = { splats, renderer: new Renderer(canvas, splats, levels, Boolean(manifest.mesh)), after: request };
   worker.postMessage({ positions: splats.positions.slice() });
   moved();
 }
@@ -109,10 +110,10 @@ function frame(now) {
     slowest = 0;
     // Where frames are slow, a sharp picture is the better greeting.
     if (pace.lean) scene.motion.rest();
-    overlays.forEach((drawOver) => drawOver(scene.motion.camera, ...size()));
     const most = Math.min(devicePixelRatio || 1, MOST), density = rough ? Math.min(most, pace.density) : most;
     fit(...size().map((v) => Math.max(1, Math.round(v * density))));
     draw(scene.motion.camera, rough && pace.lean);
+    overlays.forEach((drawOver) => drawOver(scene.motion.camera, ...size(), !rough));
     drawn = rough ? ROUGH : SHARP;
     wasRough = rough;
   }
@@ -138,6 +139,7 @@ export async function picture(view) {
       while (request !== sortedFor) await new Promise((go) => setTimeout(go, 5));
     }
     draw(scene.motion.camera);
+    overlays.forEach((drawOver) => drawOver(scene.motion.camera, ...size(), true));
     return await new Promise((done) => canvas.toBlob(done));
   } finally {
     capturing = false;
@@ -152,6 +154,12 @@ export function hitAt(x, y) {
 }
 
 export const placeAt = (x, y, depth) => scene.motion.camera.unproject(x, y, depth, ...size());
+
+/// Whether a point at a position and depth is in front of all surfaces, or on one.
+export function seenAt(x, y, depth) {
+  const hit = hitAt(x, y);
+  return !hit || depth < 1.05 * hit.depth;
+}
 
 /// The point of the scene at a position; where nothing is, one at the distance of the pivot.
 export function surface(x, y) {
@@ -169,7 +177,7 @@ export function aimAt(which) {
 export function keepContext(again) {
   canvas.addEventListener("webglcontextlost", (e) => e.preventDefault());
   canvas.addEventListener("webglcontextrestored", () => {
-    scene.renderer = new Renderer(canvas, scene.splats, levels);
+    scene.renderer = new Renderer(canvas, scene.splats, levels, Boolean(manifest.mesh));
     again();
     moved();
   });

@@ -4,8 +4,6 @@ import { find, levels, scene, views } from "splatvk/page";
 
 /// Shares of the splats of a thing of its own: below are crumbs, above is the ground with all on it.
 const CRUMB = 0.002, GROUND = 0.25;
-/// Least share of the splats that is taken for the main things.
-const FEW = 0.01;
 /// Margin around the things, as a share of the picture, and the least share of its usual size to
 /// which the photo is reduced for them.
 const MARGIN = 0.03, LEAST = 0.8;
@@ -40,9 +38,9 @@ function outside({ centre, radius }, up) {
 /// in it: as near as the main things fit into it between the controls.
 export function frameStart(camera, width, height) {
   if (!views.length || !width || !height) return;
-  scene.subject ??= subjectOf(scene.splats);
   // In units of the height of the photo, about its middle.
-  const box = boxOf(scene.subject, camera);
+  scene.subject ??= subjectOf(scene.splats, camera);
+  const box = scene.subject;
   if (!box) return;
   // On a low picture the controls would leave no room.
   const bars = height > 420 ? [".v-top", ".v-bottom"].map((bar) => barOf(find(bar))) : [0, 0], free = [width, height - bars[0] - bars[1]];
@@ -61,9 +59,9 @@ export function frameStart(camera, width, height) {
 /// Height that a row of controls covers.
 const barOf = ({ offsetHeight }) => (offsetHeight ? offsetHeight + 16 : 0);
 
-/// Indices of the splats of the main things: those within half of the photos; where language knows things,
-/// those of things only.
-function subjectOf({ count, codes, positions, unseen }) {
+/// Box of the main things in a camera: of those that its photo shows whole; where language knows
+/// none, of the splats within half of the photos, without a tenth at every side.
+function subjectOf({ count, codes, positions, unseen }, camera) {
   const inside = (p) => views.filter((v) => {
     const [x, y, z] = add(rotate(v.rotation, p), v.translation);
     const [u, w] = [v.fx * x / z + v.cx, v.fy * y / z + v.cy];
@@ -73,28 +71,39 @@ function subjectOf({ count, codes, positions, unseen }) {
   for (let i = 0; i < count; i++) {
     if (!unseen?.[i] && inside(positions.subarray(3 * i, 3 * i + 3)) >= 0.5 * views.length) seen.push(i);
   }
-  const level = levels.findLastIndex((l) => l.colours.length);
-  if (level < 0 || !codes[level]) return { list: seen, things: false };
-  const sizes = levels[level].colours.map(() => 0), bearing = new Set(levels[level].standing.map(([on]) => on));
-  codes[level].forEach((code) => { if (code) sizes[code - 1]++; });
-  const isThing = (code) => code >= 0 && !bearing.has(code) && sizes[code] > CRUMB * count && sizes[code] < GROUND * count;
-  const things = seen.filter((i) => isThing(codes[level][i] - 1));
-  return things.length > FEW * count ? { list: things, things: true } : { list: seen, things: false };
+  const things = thingsOf(seen, codes[levels.findLastIndex((l) => l.colours.length)]);
+  const edges = [0.55 * camera.ratio, 0.55];
+  const boxes = things.map((list) => boxOf(list, camera, 0.01)).filter((box) => box && edges.every((edge, k) => box[0][k] > -edge && box[1][k] < edge));
+  if (!boxes.length) return boxOf(seen, camera, 0.1);
+  const over = (all, box) => [0, 1].map((end) => [0, 1].map((k) => (end ? Math.max : Math.min)(all[end][k], box[end][k])));
+  return boxes.reduce(over);
 }
 
-/// Least and largest (x, y) of the splats of a camera, in units of the height of its photo, about
-/// the principal point; without the outermost.
-function boxOf({ list, things }, camera) {
-  const away = things ? 0.01 : 0.1, places = [];
+/// Splats of each thing of its own; none without codes.
+function thingsOf(list, codes) {
+  if (!codes) return [];
+  const level = levels.findLastIndex((l) => l.colours.length), things = new Map();
+  const bearing = new Set(levels[level].standing.map(([on]) => on + 1));
+  for (const i of list) {
+    if (!codes[i] || bearing.has(codes[i])) continue;
+    if (!things.has(codes[i])) things.set(codes[i], []);
+    things.get(codes[i]).push(i);
+  }
+  return [...things.values()].filter((own) => own.length > CRUMB * codes.length && own.length < GROUND * codes.length);
+}
+
+/// Least and largest (x, y) of splats in a camera, in units of the height of its photo, about the
+/// principal point; without a share of the outermost at every side.
+function boxOf(list, camera, away) {
+  const places = [];
   for (const i of list) {
     const [x, y, z] = rotate(camera.rotation, sub(scene.splats.positions.subarray(3 * i, 3 * i + 3), camera.position));
     if (z > 0) places.push([camera.focal * camera.aspect * x / z, camera.focal * y / z]);
   }
   if (places.length < 10) return null;
-  const ends = [0, 1].map((k) => {
+  const [x, y] = [0, 1].map((k) => {
     const sorted = Float32Array.from(places, (p) => p[k]).sort(), at = Math.floor(away * sorted.length);
     return [sorted[at], sorted[sorted.length - 1 - at]];
   });
-  const [x, y] = ends;
   return x[1] > x[0] && y[1] > y[0] ? [[x[0], y[0]], [x[1], y[1]]] : null;
 }

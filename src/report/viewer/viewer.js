@@ -1,11 +1,15 @@
 // Page of the viewer: loads the scene, and connects canvas, controls and panels. All data are in
 // the page (#v-manifest), or come from the server that sent it.
+import { cameraOf, early, late } from "splatvk/address";
+import { Camera } from "splatvk/camera";
 import { fold, makeRoom } from "splatvk/card";
 import { button, controls, fullScreen } from "splatvk/controls";
 import { tellOuter } from "splatvk/frame";
 import { Tape } from "splatvk/measure";
+import { connectMesh, nextMesh } from "splatvk/mesh";
 import { Motion } from "splatvk/motion";
 import { canvas, find, levels, manifest, root, say, scene, state, up, views } from "splatvk/page";
+import { hidePanels, takeTaps, tapTool } from "splatvk/panel";
 import { wholeOf } from "splatvk/pick";
 import { follow, kept } from "splatvk/preview";
 import { answers, ask, highlight, listQueries, setQuery } from "splatvk/queries";
@@ -14,13 +18,17 @@ import { download, gunzip, medianDepth, unpack } from "splatvk/splats";
 import { aimAt, begin, changed, hitAt, keepContext, moved, overlay, picture, placeAt, replace, settled, size, start, surface } from "splatvk/stage";
 import { firstCamera, frameStart } from "splatvk/start";
 import { connectPage } from "splatvk/things";
+import { connectViews, loadViews, namedCamera, showNotes, startCamera, toggleViews } from "splatvk/views";
 
 const tape = new Tape(find(".v-tape"), find(".v-line"), manifest.metres, say);
-let input;
+/// Whether the start is that of [`frameStart`].
+let input, isFramed = false;
 
 // --- scene --------------------------------------------------------------------------------------
 
 async function load() {
+  early({ showNotes });
+  const named = loadViews();
   const inline = document.getElementById("v-splats"), wait = find(".v-wait");
   if (inline) {
     wait.textContent = "Unpacking …";
@@ -30,13 +38,18 @@ async function load() {
     : await download(manifest.scene, (share) => { wait.textContent = `Loading the scene … ${Math.floor(100 * share)} %`; });
   const splats = unpack(await gunzip(packed));
   inline?.remove();
+  await named;
   begin(splats);
   keepContext(restore);
-  const home = firstCamera(views, scene.extent, up);
-  scene.near = 0.01 * medianDepth(splats, home);
-  home.distance = 100 * scene.near;
-  aimAt(home);
-  frameStart(home, ...size());
+  const photo = firstCamera(views, scene.extent, up);
+  scene.near = 0.01 * medianDepth(splats, photo);
+  const chosen = cameraOf({ namedCamera, photoCamera }) ?? startCamera(), home = chosen ?? photo;
+  if (!chosen) {
+    home.distance = 100 * scene.near;
+    aimAt(home);
+    isFramed = true;
+    frameStart(home, ...size());
+  }
   // A tenth of the usual depth: nearer, a single surface fills the picture.
   scene.motion = new Motion({ home, views, up, closest: 10 * scene.near }, { aim: aimAt, moved, shown: markPhoto, playing });
   kept.take(scene.motion);
@@ -48,6 +61,15 @@ async function load() {
   start(() => input?.pending());
   if (root.classList.contains("full")) root.focus();
   if (manifest.renews) follow(manifest, { renew, say: (text) => say(text, true), leave: () => kept.put(scene.motion) });
+}
+
+/// Camera of a photo by its name, or by its number from 1.
+function photoCamera(name) {
+  const at = views.findIndex((v, i) => v.name === name || String(i + 1) === name);
+  if (at < 0) return null;
+  const camera = Camera.of(views[at], 100 * scene.near);
+  aimAt(camera);
+  return camera;
 }
 
 /// Loads the splats again, of the same scene.
@@ -65,7 +87,7 @@ function restore() {
 function resized() {
   const { motion } = scene;
   if (!size()[0]) return;
-  frameStart(motion.home, ...size());
+  if (isFramed) frameStart(motion.home, ...size());
   if (motion.untouched) motion.camera = Object.assign(motion.home.copy(), { inset: motion.inset });
   makeRoom();
   moved();
@@ -82,6 +104,7 @@ function playing(on) {
 // --- actions ------------------------------------------------------------------------------------
 
 function clear() {
+  if (tapTool()) return giveUp();
   if (manifest.framed) tellOuter({ selected: null });
   state.selected = state.picked = null;
   scene.renderer.select(-1, []);
@@ -93,10 +116,17 @@ function clear() {
   changed();
 }
 
+/// Ends the tool that takes taps.
+function giveUp() {
+  takeTaps(null);
+  say("");
+}
+
 /// Selects the code at a position, measures to it, or makes it the centre of turning.
 function tap(x, y, centre) {
   const hit = hitAt(x, y);
   if (centre) return hit && scene.motion.turn((camera) => camera.aim(placeAt(x, y, hit.depth)));
+  if (tapTool()) return tapTool()(hit && { x, y, point: placeAt(x, y, hit.depth), codes: hit.codes });
   if (tape.active) return hit ? measureAt(x, y, hit.depth) : say("Nothing to measure to there.");
   if (!hit) return clear();
   const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : wholeOf(scene.splats, levels, hit.codes);
@@ -137,6 +167,8 @@ const actions = {
   reset: () => scene.motion.goTo(scene.motion.home.copy(), -1),
   full: () => fullScreen(root),
   measure: () => measure(),
+  views: toggleViews,
+  mesh: nextMesh,
   help: () => find(".v-help").showModal(),
 };
 
@@ -154,11 +186,13 @@ function connect() {
   find(".v-card .v-close").onclick = clear;
   find(".v-fold").onclick = fold;
   connectQueries();
+  connectMesh();
+  connectViews({ goTo: (name) => scene.motion.goTo(namedCamera(name), -1) });
   const toView = (act) => (...given) => (root.scrollIntoView({ block: "nearest" }), act(...given));
   const selectCode = (level, code) => (setQuery(null), select(level, { codes: levels.map((_, at) => (at === level ? code : -1)) }));
   connectPage({ splats: scene.splats, levels, answers }, { ask: toView(ask), select: toView(selectCode) });
   const fills = () => document.fullscreenElement === root || root.matches(".full, .wide");
-  input = controls({ root, canvas, motion: scene.motion, actions, tap, tapsAtOnce: () => tape.active, surface, fills, nextMode, toggleGuessed, clear });
+  input = controls({ root, canvas, motion: scene.motion, actions, tap, tapsAtOnce: () => tape.active || tapTool() !== null, surface, fills, nextMode, toggleGuessed, clear: () => hidePanels() || clear() });
 }
 
 function connectQueries() {
@@ -175,7 +209,7 @@ function connectQueries() {
 
 /// Interface for scripts and tests, `splatvk` in the console.
 window.splatvk = {
-  ready: load().then(connect),
+  ready: load().then(connect).then(() => late({ ask, show, modes, play: actions.play })),
   state,
   camera: () => scene.motion.camera,
   tape,

@@ -7,8 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 /// Advice where the program is missing.
-const INSTALL: &str =
-    "install it (tools/setup; apt-get install ffmpeg; brew install ffmpeg), or leave the video out";
+const INSTALL: &str = "install it (tools/setup; apt-get install ffmpeg; brew install ffmpeg)";
 
 /// Writer of an H.264 video in an MP4 file, frame by frame. Dropped without
 /// [`VideoWriter::finish`], it ends the program, and the file is not playable.
@@ -20,14 +19,15 @@ pub struct VideoWriter {
 }
 
 impl VideoWriter {
-    /// Refuses a machine without ffmpeg or without its encoder, before any work.
-    pub fn check() -> Result<()> {
+    /// Refuses a machine without ffmpeg or without its encoder, before any work. `asked` names what
+    /// needs it, and `instead` the way without it.
+    pub fn check(asked: &str, instead: &str) -> Result<()> {
         let encoders =
             Command::new("ffmpeg").args(["-hide_banner", "-encoders"]).stdin(Stdio::null()).output();
         match encoders {
-            Err(_) => Err(Error::missing(format!("--video: ffmpeg is not there; {INSTALL}"))),
+            Err(_) => Err(Error::missing(format!("{asked}: ffmpeg is not there; {INSTALL}, {instead}"))),
             Ok(o) if !String::from_utf8_lossy(&o.stdout).contains("libx264") => {
-                Err(Error::missing(format!("--video: this ffmpeg has no libx264; {INSTALL}")))
+                Err(Error::missing(format!("{asked}: this ffmpeg has no libx264; {INSTALL}, {instead}")))
             }
             Ok(_) => Ok(()),
         }

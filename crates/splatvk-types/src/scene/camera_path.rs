@@ -73,6 +73,16 @@ impl CameraOrbit {
         CameraOrbit { photos: order.into_iter().map(|(_, c)| c.clone()).collect(), middle, target, up }
     }
 
+    /// The point that the photos look at.
+    pub fn target(&self) -> DVec3 {
+        self.target
+    }
+
+    /// Unit vector up.
+    pub fn up(&self) -> DVec3 {
+        self.up
+    }
+
     /// Mean of the directions that are up in the images of cameras; not of unit length.
     pub fn mean_up(cameras: &[Camera]) -> DVec3 {
         cameras.iter().map(|c| -c.pose.rotation.row(1)).sum()
