@@ -282,7 +282,7 @@ fn check_phone_layout(page: &mut Page) {
     );
     assert_eq!(outside, json!([]), "reaches out of the screen");
     let small = page.run(
-        "[...document.querySelectorAll('.v-tools button, .v-photos button, .v-modes button')].filter((e) => \
+        "[...document.querySelectorAll('.v-tools button, .v-photos button, .v-modes button')].filter((e) => e.offsetParent && \
          e.getBoundingClientRect().height < 38).length",
     );
     assert_eq!(small, 0, "too small for a finger");

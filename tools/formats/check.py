@@ -503,6 +503,9 @@ def json_formats():
     for name in ("cameras", "transforms", "transforms-read"):
         said(None, "render", small, "--cameras", SCHEMAS / f"examples/{name}.json", "--out", WORK / f"by-{name}")
         assert any(WORK.glob(f"by-{name}/*.png")), f"{name}.json: nothing was rendered"
+    shutil.copy(SCHEMAS / "examples/views.json", small / "views.json")
+    said(None, "render", small, "--view", "From the right", "--height", 48, "--out", WORK / "by-view")
+    assert any(WORK.glob("by-view/*.png")), "views.json: nothing was rendered"
     events |= said(None, "query", WORK / "nowhere", "lemon")
     assert events >= {"begin", "step", "figures", "end", "error"}, f"the logs only have {sorted(events)}"
     print("ok  output and logs of query, eval, measure, train, models list, doctor and bench")

@@ -1,4 +1,5 @@
-// Measures viewers: node bench.mjs FOLDER WIDTHxHEIGHT ROUNDS. FOLDER holds scene.ply, scene.html and transforms.json.
+// Measures viewers: node bench.mjs FOLDER WIDTHxHEIGHT ROUNDS. FOLDER holds scene.ply, scene.html and
+// camera.json.
 import { createServer } from "node:http";
 import { readFile } from "node:fs/promises";
 import { dirname, join, normalize } from "node:path";
@@ -9,7 +10,7 @@ const HERE = dirname(fileURLToPath(import.meta.url));
 const [folder, shape, rounds] = process.argv.slice(2);
 const [width, height] = shape.split("x").map(Number);
 /// Time of a drag and of the pause before it, ms.
-const DRAG = 5000, PAUSE = 3000;
+const DRAG = 8000, PAUSE = 6000;
 const TYPES = { html: "text/html", js: "text/javascript", mjs: "text/javascript", css: "text/css", json: "application/json", wasm: "application/wasm" };
 
 if (!installed()) {
@@ -17,14 +18,8 @@ if (!installed()) {
   process.exit(0);
 }
 
-/// The first photo's camera, OpenCV axes: position, a point ahead, and the vertical field of view in degrees.
-const camera = await (async () => {
-  const { frames, ...shared } = JSON.parse(await readFile(join(folder, "transforms.json"), "utf8"));
-  const frame = frames[0], m = frame.transform_matrix, { h, fl_y } = { ...shared, ...frame };
-  // The file has OpenGL cameras, which look along −z.
-  const at = m.slice(0, 3).map((row) => row[3]), ahead = m.slice(0, 3).map((row) => -row[2]);
-  return { at, to: at.map((v, k) => v + ahead[k]), fov: 2 * Math.atan(h / (2 * fl_y)) * 180 / Math.PI };
-})();
+/// Camera at the start, OpenCV axes: position, a point ahead, and the vertical field of view in degrees.
+const camera = JSON.parse(await readFile(join(folder, "camera.json"), "utf8"));
 
 const three = (body) => `<!doctype html><meta charset="utf-8"><style>body { margin: 0; overflow: hidden } canvas, #root { width: 100vw; height: 100vh; display: block }</style>
 <div id="root"></div><script type="importmap">{ "imports": { "three": "/node_modules/three/build/three.module.js", "three/addons/": "/node_modules/three/examples/jsm/",
@@ -123,7 +118,7 @@ async function measure(browser, { name, url, ready }, round) {
     mouse("mouseMoved", cx + 0.15 * width * Math.sin(2 * t), cy + 0.08 * height * Math.sin(1.3 * t));
     await new Promise((go) => setTimeout(go, 16));
   }
-  const times = await page.evaluate(() => (cancelAnimationFrame(window.noting), window.frameTimes.slice(2)));
+  const times = await page.evaluate(() => (cancelAnimationFrame(window.noting), window.frameTimes.slice(1)));
   if (process.env.KEEP && round === 0) await page.screenshot({ path: join(process.env.KEEP, `${name.replace(/\W+/g, "-")}.png`) });
   mouse("mouseReleased", cx, cy);
   await page.close();
@@ -145,7 +140,8 @@ for (let round = 0; round < Number(rounds); round++) {
 }
 server.close();
 console.log(`${width} x ${height}, ${rounds} rounds of ${DRAG / 1000} s; milliseconds per frame while dragging, median of the rounds' medians`);
-for (const [name, list] of all) {
+for (let [name, list] of all) {
+  list = list.filter((times) => times.length);
   if (!list.length) continue;
   const [medians, slow] = [0.5, 0.95].map((share) => list.map((times) => quantile(times, share)));
   console.log(`${name.padEnd(26)} median ${quantile(medians, 0.5).toFixed(0).padStart(5)}   95 % ${quantile(slow, 0.5).toFixed(0).padStart(5)}   frames ${list.map((t) => t.length).join(", ")}`);

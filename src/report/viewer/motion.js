@@ -11,7 +11,10 @@ const PAUSE = 150;
 
 /// Bounds of pixels per CSS pixel in moving pictures. Below the least, things are hard to make out;
 /// above two, no difference is visible.
-const LEAST = 0.5;
+const LEAST = 0.35;
+/// Least share of the splats in moving pictures. Those that are left are larger, so that surfaces
+/// stay closed.
+const FEWEST = 0.2;
 export const MOST = 2;
 
 const ease = (t) => t * t * (3 - 2 * t);
@@ -33,11 +36,13 @@ export class Motion {
     this.swayAt = still.matches ? null : Infinity;
     this.onScreen = false;
     this.used = false;
+    // Whether the first picture stands, in full quality.
+    this.greeted = false;
     this.stirredAt = this.last = -1e9;
   }
 
   get #sways() {
-    return this.swayAt !== null && this.onScreen;
+    return this.swayAt !== null && this.onScreen && this.greeted;
   }
 
   /// Whether nobody has moved the camera yet.
@@ -174,13 +179,25 @@ export class Motion {
   }
 }
 
-/// Chooses the quality of moving pictures by the time that frames take.
+/// Chooses the quality of moving pictures by the time that frames take: first fewer pixels, then
+/// fewer splats.
 export class Pace {
   constructor() {
-    // Pixels per CSS pixel, whether to save what can be saved, and the slow frames in a row.
+    // Pixels per CSS pixel, whether to save what can be saved, the share of splats, and the slow
+    // frames in a row.
     this.density = 1;
     this.lean = false;
+    this.share = 1;
     this.slow = 0;
+  }
+
+  /// Begins by the time of a picture in full quality, milliseconds: half of it is left without
+  /// harmonics, and the pixels are not all of the rest.
+  expect(time) {
+    if (time < 100) return;
+    this.lean = true;
+    this.density = Math.max(LEAST, Math.min(1, Math.sqrt(80 / time)));
+    if (this.density === LEAST) this.share = Math.max(FEWEST, Math.min(1, 600 / time));
   }
 
   /// Notes the time of a moving frame, milliseconds. Within 25 and 50, nothing changes.
@@ -188,7 +205,9 @@ export class Pace {
     this.slow = time > 50 ? this.slow + 1 : 0;
     // One frame of 100 ms may be the page's own work; three, or one of 200, are the pixels.
     if (time > 200 || this.slow >= 3) this.lean = true;
-    if (time > 50) this.density = Math.max(LEAST, this.density * Math.max(0.5, Math.sqrt(40 / time)));
+    if (time > 50 && this.density === LEAST) this.share = Math.max(FEWEST, this.share * Math.max(0.5, 50 / time));
+    else if (time > 50) this.density = Math.max(LEAST, this.density * Math.max(0.5, Math.sqrt(40 / time)));
+    else if (time < 25 && this.share < 1) this.share = Math.min(1, this.share * 1.2);
     else if (time < 25) this.density = Math.min(MOST, this.density * 1.1);
     if (time < 25 && this.density >= 1) this.lean = false;
   }

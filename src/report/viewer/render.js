@@ -14,6 +14,9 @@ const BATCH = 128;
 /// promises.
 const ROW = 2048;
 
+/// Alpha where splats of a lean picture end: half as many pixels as to the last step of a byte.
+const FAINT = 0.05;
+
 const TRIANGLE = `#version 300 es
 void main() { gl_Position = vec4(vec2((gl_VertexID & 1) * 4 - 1, (gl_VertexID & 2) * 2 - 1), 0.0, 1.0); }`;
 
@@ -31,7 +34,7 @@ uniform mat3 rotation;       // world to camera
 uniform vec3 translation, position;
 uniform vec4 intrinsics;     // fx, fy, cx, cy in pixels
 uniform vec2 size;
-uniform float near, guessed; // guessed: opacity of what no photo shows
+uniform float near, guessed, grow, faint; // opacity of what no photo shows; added to log scales; alpha where quads end
 layout(location = 0) out uvec4 place;   // centre in pixels, direction of the major axis
 layout(location = 1) out uvec4 extent;  // standard deviations in pixels, reach in those, visible
 layout(location = 2) out uvec4 payload; // blended values, opacity
@@ -75,7 +78,7 @@ void main() {
   vec2 rg = unpackHalf2x16(a.w), bo = unpackHalf2x16(b.x), s01 = unpackHalf2x16(b.y), s2u = unpackHalf2x16(b.z);
   float opacity = s2u.y > 0.5 ? bo.y * guessed : bo.y;
   if (t.z <= near || opacity < ALPHA_MIN) return;
-  vec3 scale = exp(vec3(s01, s2u.x));
+  vec3 scale = exp(vec3(s01, s2u.x) + grow);
   // Smallest three, as in the file.
   vec3 small = (vec3(uvec3(b.w, b.w >> 10, b.w >> 20) & 1023u) / 511.5 - 1.0) * 0.7071067811865476;
   float big = sqrt(max(0.0, 1.0 - dot(small, small)));
@@ -103,8 +106,9 @@ void main() {
   float middle = 0.5 * (xx + yy), spread = length(vec2(0.5 * (xx - yy), xy));
   float major = middle + spread, minor = max(middle - spread, 1e-6);
   vec2 along = abs(xy) > 1e-6 * major ? normalize(vec2(xy, major - xx)) : xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
-  // The quad ends where alpha falls below 1/255.
-  float reach = sqrt(2.0 * log(opacity / ALPHA_MIN));
+  // The quad ends where alpha falls below 1/255, in motion earlier.
+  if (opacity <= faint) return;
+  float reach = sqrt(2.0 * log(opacity / faint));
   vec2 pixel = focal * slope + centre, deviations = vec2(sqrt(major), sqrt(minor));
   vec2 box = reach * (deviations.x * abs(along) + deviations.y * abs(along.yx));
   if (any(lessThan(pixel, -box)) || any(greaterThan(pixel, size + box))) return;
@@ -134,7 +138,6 @@ const VERTEX = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D;
 uniform usampler2D place, extent, payload;
 uniform vec2 size;
-uniform int lean;
 flat out vec4 value;  // blended values, opacity
 out vec2 offset;      // in standard deviations
 void main() {
@@ -146,10 +149,9 @@ void main() {
   vec3 far = uintBitsToFloat(e.xyz);
   vec4 p = uintBitsToFloat(texelFetch(place, cell, 0));
   value = uintBitsToFloat(texelFetch(payload, cell, 0));
-  // Corners of the square about the circle of radius 1, or of the triangle: half the set-up, and
-  // a third more pixels, which are discarded.
+  // Corners of the square about the circle of radius 1.
   int x = (gl_VertexID & 1) * 2 - 1, y = (gl_VertexID & 2) - 1;
-  offset = far.z * (lean == 0 ? vec2(x, y) : y < 0 ? vec2(1.7320508 * float(x), -1.0) : vec2(0.0, 2.0));
+  offset = far.z * vec2(x, y);
   vec2 pixel = p.xy + offset.x * far.x * p.zw + offset.y * far.y * vec2(-p.w, p.z);
   gl_Position = vec4(pixel.x / size.x * 2.0 - 1.0, 1.0 - pixel.y / size.y * 2.0, 0.0, 1.0);
 }`;
@@ -246,6 +248,7 @@ export class Renderer {
     this.textures.table = this.texture();
     this.sendTable();
     this.count = 0;
+    this.grow = 0;
     this.range = [1, 2];
     this.doubt = false;
     const rows = Math.ceil(splats.count / ROW) || 1;
@@ -260,9 +263,9 @@ export class Renderer {
     this.array = gl.createVertexArray();
     gl.bindVertexArray(this.array);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    // Two triangles per splat, and after those of a batch one.
+    // Two triangles per splat.
     const of = (corners) => Array.from({ length: BATCH }, (_, k) => corners.map((c) => 4 * k + c)).flat();
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, Uint16Array.from([...of([0, 1, 2, 2, 1, 3]), ...of([0, 1, 2])]), gl.STATIC_DRAW);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, Uint16Array.from(of([0, 1, 2, 2, 1, 3])), gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     this.images = new Map();
   }
@@ -360,7 +363,8 @@ export class Renderer {
     this.sendTable();
   }
 
-  setOrder({ sorted, near, far }) {
+  /// Takes a sorted order of a share of the splats.
+  setOrder({ sorted, near, far, share }) {
     const { gl } = this, rows = Math.floor(sorted.length / ROW), rest = sorted.length - rows * ROW;
     const send = (y, width, height) =>
       gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, y, width, height, gl.RED_INTEGER, gl.UNSIGNED_INT, sorted, y * ROW);
@@ -368,6 +372,8 @@ export class Renderer {
     if (rows) send(0, ROW, rows);
     if (rest) send(rows, rest, 1);
     this.count = sorted.length;
+    // Half of the area of those that are left out, in the logarithm: surfaces have several layers.
+    this.grow = -0.25 * Math.log(share);
     this.range = [near, far];
   }
 
@@ -399,8 +405,8 @@ export class Renderer {
   }
 
   /// Draws the image of a camera at the size of the canvas. `guessed` is the opacity of what no
-  /// photo shows. `lean`, for moving pictures, omits harmonics, blends colours in bytes and draws
-  /// one triangle per splat.
+  /// photo shows. `lean`, for moving pictures, omits harmonics, blends colours in bytes and ends
+  /// splats early.
   draw(camera, { mode, level, selecting, near, guessed, lean }) {
     const { gl } = this, [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
     let at = this.use(this.project, this.textures);
@@ -418,6 +424,8 @@ export class Renderer {
     gl.uniform2f(at.size, width, height);
     gl.uniform1f(at.near, near);
     gl.uniform1f(at.guessed, guessed);
+    gl.uniform1f(at.grow, this.grow);
+    gl.uniform1f(at.faint, lean ? FAINT : 1 / 255);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.projection);
     gl.viewport(0, 0, ROW, Math.ceil(this.count / ROW));
     gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -431,12 +439,10 @@ export class Renderer {
     gl.clear(gl.COLOR_BUFFER_BIT);
     at = this.use(this.quads, this.projected);
     gl.uniform2f(at.size, width, height);
-    gl.uniform1i(at.lean, lean ? 1 : 0);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.array);
-    const [corners, from] = lean ? [3, 2 * 6 * BATCH] : [6, 0];
-    gl.drawElementsInstanced(gl.TRIANGLES, corners * BATCH, gl.UNSIGNED_SHORT, from, Math.ceil(this.count / BATCH));
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / BATCH));
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
 

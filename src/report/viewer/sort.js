@@ -1,5 +1,5 @@
 // Worker that sorts the splats in view of a camera, far to near. It receives the positions once,
-// then requests {id, rotation, translation, near, slope}, and posts sorted indices with the 1 % and
+// then requests {id, rotation, translation, near, slope, share: of the splats}, and posts sorted indices with the 1 % and
 // 99 % quantiles of depth. Radix sort on the bits of z: exact, and linear in the number of splats.
 let positions = null, keys, pairs, order, counts;
 
@@ -12,10 +12,12 @@ self.onmessage = ({ data }) => {
     counts = new Uint32Array(65536);
     return;
   }
-  const { id, rotation: r, translation: t, near, slope } = data;
+  const { id, rotation: r, translation: t, near, slope, share } = data, limit = share * 2 ** 32;
   const z = new Float32Array(1), bits = new Uint32Array(z.buffer);
   let m = 0;
   for (let i = 0, p = 0; p < positions.length; i++, p += 3) {
+    // Multiples of the golden ratio pick evenly, and neighbours are neighbours in the file, too.
+    if (share < 1 && Math.imul(i, 0x9e3779b1) >>> 0 > limit) continue;
     const x = positions[p], y = positions[p + 1], w = positions[p + 2];
     z[0] = r[6] * x + r[7] * y + r[8] * w + t[2];
     if (!(z[0] > near)) continue;
@@ -47,5 +49,5 @@ self.onmessage = ({ data }) => {
     bits[0] = ~keys[0][Math.round((m - 1) * (1 - share))];
     return z[0];
   };
-  self.postMessage({ id, sorted, near: depth(0.01), far: depth(0.99) }, [sorted.buffer]);
+  self.postMessage({ id, share, sorted, near: depth(0.01), far: depth(0.99) }, [sorted.buffer]);
 };

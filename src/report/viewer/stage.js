@@ -1,15 +1,22 @@
 // Drawing of the scene: order of the splats, frames in motion and at rest, pictures, and the
 // surface at a position.
-import { Camera } from "splatvk/camera";
+import { Camera, dot, sub } from "splatvk/camera";
 import { MOST, Pace } from "splatvk/motion";
 import { pick } from "splatvk/pick";
 import { Renderer } from "splatvk/render";
-import { canvas, levels, manifest, scene, state, views } from "splatvk/page";
+import { canvas, levels, manifest, root, scene, state, views } from "splatvk/page";
 import { extentOf } from "splatvk/splats";
 
 const STALE = 0, ROUGH = 1, SHARP = 2;
+/// Milliseconds after the first picture in which its time shows as a late frame.
+const GREETING = 250;
 let worker, next = null, request = 0, sortedFor = -1, waiting = false, drawn = STALE, capturing = false;
-let last = 0, slowest = 0, wasRough = false;
+/// Camera of the last requested order, and the share of the splats in the shown one.
+let asked = null, sortedShare = 1;
+let last = 0, slowest = 0, wasRough = false, greetedAt = 0;
+/// Turn (cosine) and move, in distances to the pivot, from which a moving picture needs another
+/// order.
+const TURN = Math.cos(2 * Math.PI / 180), MOVE = 0.02;
 const idle = [], pace = new Pace(), overlays = [];
 /// Whether something waits to be drawn before the picture counts as settled.
 let pending = () => false;
@@ -57,9 +64,10 @@ function sorted(data) {
   if (!next) {
     scene.renderer.setOrder(data);
     sortedFor = data.id;
+    sortedShare = data.share;
     drawn = STALE;
   }
-  if (request !== sortedFor) sort();
+  if (next || request !== sortedFor) sort();
 }
 
 /// Size of the picture in CSS pixels, or of one that is captured.
@@ -69,13 +77,25 @@ function fit(width, height) {
   if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
 }
 
+/// Requests an order: in motion only where the last one no longer fits, since sorting takes the time
+/// of drawing on small machines.
 function sort() {
-  if (waiting) return;
+  const moving = scene.motion.moving(performance.now());
+  if (waiting || moving && !next && isNear(asked, scene.motion.camera)) return;
   waiting = true;
+  asked = scene.motion.camera.copy();
+  const share = moving ? pace.share : 1;
   const { camera } = scene.motion, [width, height] = size(), [fx, fy, cx, cy] = camera.intrinsics(width, height);
   // Half an image more on every side, since splats reach beyond their centre.
   const slope = [(Math.max(cx, width - cx) + width / 2) / fx, (Math.max(cy, height - cy) + height / 2) / fy];
-  worker.postMessage({ id: request, rotation: camera.rotation, translation: camera.translation, near: scene.near, slope });
+  worker.postMessage({ id: request, rotation: camera.rotation, translation: camera.translation, near: scene.near, slope, share });
+}
+
+/// Whether the order for one camera fits another.
+function isNear(a, b) {
+  if (!a) return false;
+  const along = dot(a.rotation.slice(6), b.rotation.slice(6)), moved = Math.hypot(...sub(a.position, b.position));
+  return along > TURN && moved < MOVE * b.distance;
 }
 
 /// Redraws after a change of the camera or of the size of the picture.
@@ -105,7 +125,13 @@ function frame(now) {
   slowest = Math.max(slowest, now - last);
   last = now;
   const rough = scene.motion.moving(now);
-  if (rough ? drawn === STALE : drawn !== SHARP && request === sortedFor) {
+  if (greetedAt && !scene.motion.greeted && now - greetedAt > GREETING) {
+    scene.motion.greeted = true;
+    pace.expect(slowest);
+  }
+  const isOrdered = request === sortedFor && sortedShare === 1;
+  if (!rough && !isOrdered) sort();
+  if (rough ? drawn === STALE : drawn !== SHARP && isOrdered) {
     if (rough && wasRough) pace.note(slowest);
     slowest = 0;
     // Where frames are slow, a sharp picture is the better greeting.
@@ -116,6 +142,9 @@ function frame(now) {
     overlays.forEach((drawOver) => drawOver(scene.motion.camera, ...size(), !rough));
     drawn = rough ? ROUGH : SHARP;
     wasRough = rough;
+    // Blurred glass over a moving picture is slow to draw, too.
+    root.classList.toggle("plain", rough && pace.lean);
+    if (!rough) greetedAt ||= now;
   }
   if (drawn === SHARP && !rough && !pending()) idle.splice(0).forEach((tell) => tell());
 }

@@ -56,7 +56,7 @@ async function load() {
   wait.remove();
   new ResizeObserver(resized).observe(canvas);
   new IntersectionObserver(([entry]) => { scene.motion.onScreen = entry.isIntersecting; }).observe(canvas);
-  overlay((camera, ...at) => tape.draw(camera, ...at, scene.near));
+  overlay((camera, width, height) => tape.draw(camera, width, height, scene.near));
   overlay(() => legend(tape.metres));
   start(() => input?.pending());
   if (root.classList.contains("full")) root.focus();
@@ -185,6 +185,7 @@ function connect() {
   }));
   find(".v-card .v-close").onclick = clear;
   find(".v-fold").onclick = fold;
+  connectBudget();
   connectQueries();
   connectMesh();
   connectViews({ goTo: (name) => scene.motion.goTo(namedCamera(name), -1) });
@@ -193,6 +194,16 @@ function connect() {
   connectPage({ splats: scene.splats, levels, answers }, { ask: toView(ask), select: toView(selectCode) });
   const fills = () => document.fullscreenElement === root || root.matches(".full, .wide");
   input = controls({ root, canvas, motion: scene.motion, actions, tap, tapsAtOnce: () => tape.active || tapTool() !== null, surface, fills, nextMode, toggleGuessed, clear: () => hidePanels() || clear() });
+}
+
+/// States how many of the splats the page has, where it has not all.
+function connectBudget() {
+  const { shown, total } = manifest, box = find(".v-budget");
+  if (!(shown < total)) return;
+  const [unit, name, digits] = total >= 1e6 ? [1e6, " million", 1] : [1, "", 0];
+  const text = (n) => (n / unit).toLocaleString("en", { minimumFractionDigits: digits, maximumFractionDigits: digits });
+  box.textContent = `shows ${text(shown)} of ${text(total)}${name} splats`;
+  box.hidden = false;
 }
 
 function connectQueries() {
