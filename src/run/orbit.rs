@@ -153,7 +153,7 @@ mod tests {
 
     #[test]
     fn orbit_is_level_and_looks_at_the_middle() {
-        let photos = photos(&[0.0, 70.0, 140.0, 210.0, 280.0]);
+        let photos = photos(&[0.0, 72.0, 144.0, 216.0, 288.0]);
         let orbit = Orbit::of_photos(&photos, TARGET, UP, None).unwrap();
         assert_eq!(orbit.span(), TAU, "photos all around");
         let cameras = orbit.cameras(36);

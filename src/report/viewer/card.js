@@ -52,7 +52,7 @@ export function makeRoom() {
   const box = find(".v-card"), chosen = state.selected ?? state.query;
   const [all, own] = [root.getBoundingClientRect(), box.getBoundingClientRect()];
   const small = all.width <= 720 || all.height < 420;
-  const middle = small && chosen && !box.hidden && !box.classList.contains("folded") && middleOf(chosen);
+  const middle = small && chosen && own.width > 0 && !box.classList.contains("folded") && middleOf(chosen);
   const sheet = own.width > 0.8 * all.width;
   const covered = sheet ? (all.bottom - own.top) / all.height : (all.right - own.left) / all.width;
   // Along the other axis, into the middle of the picture.
