@@ -71,9 +71,10 @@ const FILES: [&str; 7] = [
     "mesh SCENE --format ply",
     "bench sort --keys 1000 --repeats 1 --json",
 ];
-const FOLDERS: [&str; 6] = [
+const FOLDERS: [&str; 7] = [
     "export SCENE --format colmap --out",
     "render SCENE --cameras CAMERAS --out",
+    "render SCENE --path orbit --seconds 0.1 --fps 20 --out",
     "query SCENE lemon --out",
     "eval SCENE --ground-truth TRUTH --out",
     "bench --write-scene",
@@ -150,6 +151,7 @@ fn force_replaces_only_same_names() {
     for (words, file) in [
         ("export SCENE --format colmap --out", "cameras.txt"),
         ("render SCENE --cameras CAMERAS --out", "train_00.png"),
+        ("render SCENE --path orbit --seconds 0.1 --fps 20 --out", "frame_0000.png"),
         ("manuals", "splatvk.1"),
         ("bench --splats 100 --width 64 --height 48 --write-scene", "scene.json"),
     ] {
@@ -162,6 +164,26 @@ fn force_replaces_only_same_names() {
         assert_eq!(std::fs::read_to_string(out.join("letter")).unwrap(), "precious");
         assert!(names(&out).iter().all(|n| !n.contains("partial")));
     }
+}
+
+#[test]
+fn film_has_its_length_and_replaces_only_with_force() {
+    let folder = tempfile::tempdir().unwrap();
+    let film = folder.path().join("film.mp4");
+    let line = command_line("render SCENE --path orbit --seconds 0.5 --fps 12 --out", &film);
+    if Command::new("ffprobe").arg("-version").output().is_err() {
+        return println!("SKIPPED: no ffmpeg here");
+    }
+    succeeds(&line);
+    let mut probe = Command::new("ffprobe");
+    probe.args(["-v", "error", "-count_frames", "-show_entries", "stream=nb_read_frames,r_frame_rate"]);
+    let output = probe.args(["-of", "csv=p=0"]).arg(&film).output().unwrap();
+    assert_eq!(String::from_utf8_lossy(&output.stdout).trim(), "12/1,6");
+    assert_refused(&line, "--force");
+    succeeds(&forced(line));
+    // Without a path there is nothing to film.
+    assert_refused(&command_line("render SCENE --cameras CAMERAS --out", &film), "--path orbit");
+    assert_eq!(names(folder.path()), ["film.mp4"]);
 }
 
 #[test]
