@@ -4,9 +4,11 @@ import { find, levels, scene, views } from "splatvk/page";
 
 /// Shares of the splats of a thing of its own: below are crumbs, above is the ground with all on it.
 const CRUMB = 0.002, GROUND = 0.25;
-/// Margin around the things, as a share of the picture, and the least share of its usual size to
-/// which the photo is reduced for them.
-const MARGIN = 0.03, LEAST = 0.8;
+/// Margin around the things, as a share of the picture.
+const MARGIN = 0.03;
+/// How far the photo is reduced for the things: 0 fills the picture, 1 shows it whole, above 1 also
+/// what is beside it.
+const LEAST = 1.3;
 /// Angle from which a scene without photos is seen from above, radians.
 const PITCH = Math.PI / 9;
 
@@ -40,13 +42,13 @@ export function frameStart(camera, width, height) {
   if (!views.length || !width || !height) return;
   // In units of the height of the photo, about its middle.
   scene.subject ??= subjectOf(scene.splats, camera);
-  const box = scene.subject;
+  const { box, least } = scene.subject;
   if (!box) return;
   // On a low picture the controls would leave no room.
   const bars = height > 420 ? [".v-top", ".v-bottom"].map((bar) => barOf(find(bar))) : [0, 0], free = [width, height - bars[0] - bars[1]];
   const heights = [height, width / camera.ratio], [whole, filled] = [Math.min(...heights), Math.max(...heights)];
   const room = [0, 1].map((k) => free[k] * (1 - 2 * MARGIN) / (box[1][k] - box[0][k]));
-  const unitLength = Math.min(Math.max(Math.min(...room), LEAST * whole), filled);
+  const unitLength = Math.min(Math.max(Math.min(...room), Math.max(0.8 * whole, least * whole + (1 - least) * filled)), filled);
   camera.cover = filled > 1.001 * whole ? Math.log(unitLength / whole) / Math.log(filled / whole) : 0;
   // Into the middle of the free part, but no edge of the photo into a picture that it fills.
   camera.shift = [0, 1].map((k) => {
@@ -59,8 +61,9 @@ export function frameStart(camera, width, height) {
 /// Height that a row of controls covers.
 const barOf = ({ offsetHeight }) => (offsetHeight ? offsetHeight + 16 : 0);
 
-/// Box of the main things in a camera: of those that its photo shows whole; where language knows
-/// none, of the splats within half of the photos, without a tenth at every side.
+/// Box of the main things in a camera, and how far the photo is reduced for it: of those that its
+/// photo shows whole; where language knows none, of the splats within half of the photos, without a
+/// tenth at every side.
 function subjectOf({ count, codes, positions, unseen }, camera) {
   const inside = (p) => views.filter((v) => {
     const [x, y, z] = add(rotate(v.rotation, p), v.translation);
@@ -74,9 +77,10 @@ function subjectOf({ count, codes, positions, unseen }, camera) {
   const things = thingsOf(seen, codes[levels.findLastIndex((l) => l.colours.length)]);
   const edges = [0.55 * camera.ratio, 0.55];
   const boxes = things.map((list) => boxOf(list, camera, 0.01)).filter((box) => box && edges.every((edge, k) => box[0][k] > -edge && box[1][k] < edge));
-  if (!boxes.length) return boxOf(seen, camera, 0.1);
+  // Without things the photo itself counts: beside it is less to see.
+  if (!boxes.length) return { box: boxOf(seen, camera, 0.1), least: 0.5 };
   const over = (all, box) => [0, 1].map((end) => [0, 1].map((k) => (end ? Math.max : Math.min)(all[end][k], box[end][k])));
-  return boxes.reduce(over);
+  return { box: boxes.reduce(over), least: LEAST };
 }
 
 /// Splats of each thing of its own; none without codes.
