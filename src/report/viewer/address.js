@@ -29,7 +29,8 @@ export function cameraOf({ namedCamera, photoCamera }) {
 export async function late({ ask, show, modes, play }) {
   const kind = given.get("show"), [mode, level] = kinds.get(kind?.toLowerCase()) ?? [];
   const text = given.get("query");
-  if (text && (find(".v-ask").hidden || manifest.presented)) say(`“${text}”: ${manifest.ask_note || "this page answers no questions; splatvk view SCENE does."}`, true);
+  const reason = manifest.ask_note || "this page answers no questions; splatvk view SCENE does.";
+  if (text && find(".v-ask").hidden) say(`“${text}”: ${reason}`, true);
   else if (text) await ask(text);
   if (kind && !modes.some((m) => m.mode === mode && m.level === level)) say(`No kind of picture is called “${kind}” here.`);
   else if (kind) show(mode, level);

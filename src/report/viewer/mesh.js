@@ -57,7 +57,9 @@ export async function nextMesh() {
   }
   kind = KINDS[(KINDS.indexOf(kind) + 1) % KINDS.length];
   find("[data-do=mesh]").setAttribute("aria-pressed", String(kind !== ""));
-  say(kind ? `Mesh: ${kind}, ${(mesh.triangles.length / 3).toLocaleString("en")} triangles.${mesh.placed ? "" : " It states no place: it is drawn in the axes of the scene."}` : "");
+  const count = (mesh.triangles.length / 3).toLocaleString("en");
+  const place = mesh.placed ? "" : " It states no place: it is drawn in the axes of the scene.";
+  say(kind ? `Mesh: ${kind}, ${count} triangles.${place}` : "");
   changed();
 }
 
