@@ -85,6 +85,7 @@ fn scene(folder: &Path) -> PathBuf {
         splats: &splats,
         seen: &Seen::default(),
         backdrop: &Splats::default(),
+        holes: &Default::default(),
         cameras: &cameras,
         world: &World::default(),
         photos: &photos,

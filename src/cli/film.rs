@@ -128,10 +128,10 @@ struct Shot {
 
 impl Shot {
     fn open(args: &RenderArgs, kind: PathKind) -> Result<Shot> {
-        let scene = scene::load(&args.scene)?;
+        let scene = scene::load(&args.scene, args.edits)?;
         let device = gpu::open(args.device.device.as_deref())?;
-        let mut viewer =
-            Viewer::new(&device, &scene.splats, &LanguageField::default())?.with_backdrop(&scene.backdrop)?;
+        let viewer = Viewer::new(&device, &scene.splats, &LanguageField::default())?;
+        let mut viewer = viewer.with_backdrop(&scene.backdrop)?.with_holes(&scene.holes)?;
         let frames = (args.seconds * f64::from(args.fps)).round().max(1.0) as usize;
         let (cameras, degrees) = match kind {
             PathKind::Orbit => {

@@ -1,5 +1,5 @@
 //! Files of a scene directory that splatvk wrote: only these may be replaced.
-use super::{cameras, scene_dir, views};
+use super::{cameras, scene_dir};
 use crate::files;
 use crate::photo::stem;
 use crate::scene::LEVEL_NAMES;
@@ -46,6 +46,7 @@ impl Names {
             "language",
             "previews",
         ];
+        // Edits and named views are the user's: they keep a scene from being replaced.
         const FILES: [&str; 12] = [
             scene_dir::MANIFEST,
             scene_dir::SPLATS,
@@ -53,7 +54,6 @@ impl Names {
             scene_dir::BACKDROP,
             scene_dir::HOLES,
             "run.json",
-            views::FILE,
             "report.html",
             "cameras/transforms.json",
             "cameras/photos.json",
