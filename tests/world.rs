@@ -55,6 +55,7 @@ fn tilted_scene(folder: &Path) -> (PathBuf, Splats, Camera) {
         splats: &splats,
         seen: &Seen { pixels: vec![0.0, 3.0] },
         backdrop: &Default::default(),
+        holes: &Default::default(),
         cameras: std::slice::from_ref(&camera),
         world: &World { up: Some(up), ..World::default() },
         photos: &[],

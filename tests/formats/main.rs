@@ -438,6 +438,7 @@ fn scene_directory_round_trips() {
         splats: &s,
         seen: &seen,
         backdrop: &Default::default(),
+        holes: &Default::default(),
         cameras: &cams,
         world: &world,
         photos: &photos,
