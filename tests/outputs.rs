@@ -370,7 +370,7 @@ fn outputs_never_replace_foreign_files() {
     // Foreign photos and notes in a scene.
     std::fs::create_dir(path_of("room/my-photos")).unwrap();
     std::fs::write(path_of("room/NOTES.txt"), "precious").unwrap();
-    assert_refused(&train(&images, &cameras), "no run wrote: NOTES.txt, my-photos;");
+    assert_refused(&train(&images, &cameras), "files of yours: NOTES.txt, my-photos;");
     std::fs::remove_dir(path_of("room/my-photos")).unwrap();
     std::fs::remove_file(path_of("room/NOTES.txt")).unwrap();
     // An input inside the scene itself.

@@ -217,7 +217,7 @@ fn force_replaces_only_pure_data_sets() {
     succeeds(&[&from[..], &[path(&regions)]].concat());
     succeeds(&[&from[..], &[path(&regions), "--force"]].concat());
     std::fs::write(data.join("letter"), "precious").unwrap();
-    assert_refused(&generate("2", &["--force"]), "did not write: letter;");
+    assert_refused(&generate("2", &["--force"]), "files of yours: letter;");
     assert_eq!(std::fs::read_to_string(data.join("letter")).unwrap(), "precious");
     std::fs::create_dir(path_of("full")).unwrap();
     std::fs::write(path_of("full/letter"), "precious").unwrap();

@@ -99,7 +99,7 @@ impl Replaced {
             Some(foreign) if !foreign.is_empty() => {
                 files::check_free_inside(out)?;
                 Err(Error::input(format!(
-                    "{place}: holds {name}, and with it files that no run wrote: {}; move them elsewhere, or choose another --out",
+                    "{place}: holds {name}, and with it files of yours: {}; move them elsewhere, or choose another --out",
                     files::listed(&foreign)
                 )))
             }
@@ -218,7 +218,7 @@ mod tests {
         for name in ["NOTES.txt", "cameras/mine.json", "previews/IMG_1.jpg", "language"] {
             std::fs::write(out.join(name), "precious").unwrap();
             for force in [false, true] {
-                refused(Workspace::create(&out, force, &[]), &format!("no run wrote: {name};"));
+                refused(Workspace::create(&out, force, &[]), &format!("files of yours: {name};"));
             }
             let w = Workspace::create(&out.with_file_name("other"), true, &[]).unwrap();
             let w = Workspace { out: out.clone(), ..w };
