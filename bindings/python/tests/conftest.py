@@ -1,12 +1,9 @@
 """A scene of four small photos, made once per session."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import splatvk
-
-PHOTOS = Path(__file__).parents[3] / "tests" / "data" / "breakfast" / "images"
+from samples import PHOTOS
 
 
 @pytest.fixture(scope="session")

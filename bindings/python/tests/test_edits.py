@@ -22,7 +22,8 @@ def test_selections_are_those_of_the_command_line(scene, copy):
     assert not solid.doubts and 0 < solid.share < 1
     same = editor.select([{"pick": {"range": {"property": "opacity", "least": 0.5}}}])
     assert np.array_equal(same.splats, solid.splats)
-    program = [sys.executable, "-m", "splatvk", "edit", copy, "--delete", "opacity>0.5", "--dry-run", "--json"]
+    program = [sys.executable, "-m", "splatvk", "edit", copy, "--delete", "opacity>0.5"]
+    program += ["--dry-run", "--json"]
     printed = json.loads(subprocess.run(program, check=True, capture_output=True).stdout)
     assert printed["made"][0]["splats"] == len(solid)
 

@@ -26,7 +26,7 @@ def test_unusable_arrays_are_refused(photos, words):
 
 def test_scene_of_arrays_is_that_of_files(scene):
     image = pytest.importorskip("PIL.Image")
-    from conftest import PHOTOS
+    from samples import PHOTOS
 
     files = sorted(PHOTOS.glob("*.jpg"))
     pixels = [np.asarray(image.open(path)) for path in files]

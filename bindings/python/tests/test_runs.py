@@ -10,7 +10,7 @@ import threading
 
 import pytest
 import splatvk
-from conftest import PHOTOS
+from samples import PHOTOS
 
 
 def test_progress(made):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import splatvk
-from conftest import PHOTOS
+from samples import PHOTOS
 
 OPTIONS = {"max_size": 160, "iterations": 10, "preset": "draft", "views": 3}
 LOOPS = 200

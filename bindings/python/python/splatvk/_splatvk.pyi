@@ -14,8 +14,10 @@ _Path: TypeAlias = str | PathLike[str]
 __all__ = [
     "Answer",
     "Camera",
+    "Editor",
     "Event",
     "Scene",
+    "Selection",
     "Thing",
     "__version__",
     "close_device",
