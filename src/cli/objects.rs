@@ -13,10 +13,9 @@ use crate::format::scene_dir::Scene;
 use crate::format::{picture, write_json};
 use crate::report::file_name;
 use crate::run::ask::QueryScene;
-use crate::run::encoder;
 use crate::run::objects::{self, NOUNS, Object, ObjectOptions};
 use crate::scene::{LEVEL_NAMES, Splats};
-use crate::{Error, Result, files, gpu};
+use crate::{Error, Result, files};
 use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
@@ -90,26 +89,7 @@ pub fn listed(
     device: &DeviceArgs,
     options: &ObjectOptions,
 ) -> Result<(QueryScene, Vec<Object>)> {
-    if scene.cameras.is_empty() {
-        return Err(Error::input(format!(
-            "{}: a file of Gaussians has no views that show its things; splatvk label makes a scene of it",
-            scene.path.display()
-        )));
-    }
-    let no_language = || {
-        Error::input(format!(
-            "{}: the scene has no language; splatvk label gives it one, splatvk run makes scenes with it",
-            scene.path.display()
-        ))
-    };
-    scene.language.as_ref().ok_or_else(no_language)?;
-    let encoder = encoder::of_scene(scene, device.registry()?)?;
-    let gpu = gpu::open(device.device.as_deref())?;
-    let field = scene.language.take().ok_or_else(no_language)?;
-    let mut ready = QueryScene::open(&gpu, (&scene.splats, &scene.cameras), field, encoder)?;
-    ready.set_views(&scene.cameras)?;
-    let list = objects::list(&mut ready, &scene.cameras, options, progress::reporter().as_ref())?;
-    Ok((ready, list))
+    objects::of_scene(scene, &device.machine(), options, progress::reporter().as_ref())
 }
 
 pub fn objects(args: &ObjectsArgs) -> Result<()> {

@@ -1,7 +1,9 @@
 //! A scene as a list of things with names, boxes and the view that shows each best.
 use super::answer::placement_json;
 use super::ask::QueryScene;
-use crate::Result;
+use super::encoder;
+use super::plan::Machine;
+use crate::format::scene_dir::Scene;
 use crate::infer::stuff;
 use crate::progress::Progress;
 use crate::query::QueryOptions;
@@ -10,6 +12,7 @@ use crate::query::phrasing;
 use crate::query::presence::Presence;
 use crate::query::things::{self, Thing};
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, World};
+use crate::{Error, Result, gpu};
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -131,6 +134,38 @@ pub fn thumbnail(picture: &RgbImage, view: &BestView) -> RgbImage {
 
 /// Smallest margin of a thumbnail, pixels.
 const SMALLEST_MARGIN: f64 = 6.0;
+
+/// The things of a loaded scene, whose language moves onto the device.
+///
+/// # Errors
+/// A scene without language or without cameras.
+pub fn of_scene(
+    scene: &mut Scene,
+    machine: &Machine,
+    options: &ObjectOptions,
+    progress: &dyn Progress,
+) -> Result<(QueryScene, Vec<Object>)> {
+    if scene.cameras.is_empty() {
+        return Err(Error::input(format!(
+            "{}: a file of Gaussians has no views that show its things; splatvk label makes a scene of it",
+            scene.path.display()
+        )));
+    }
+    let no_language = || {
+        Error::input(format!(
+            "{}: the scene has no language; splatvk label gives it one, splatvk run makes scenes with it",
+            scene.path.display()
+        ))
+    };
+    scene.language.as_ref().ok_or_else(no_language)?;
+    let encoder = encoder::of_scene(scene, machine.registry()?)?;
+    let gpu = gpu::open(machine.device.as_deref())?;
+    let field = scene.language.take().ok_or_else(no_language)?;
+    let mut ready = QueryScene::open(&gpu, (&scene.splats, &scene.cameras), field, encoder)?;
+    ready.set_views(&scene.cameras)?;
+    let list = list(&mut ready, &scene.cameras, options, progress)?;
+    Ok((ready, list))
+}
 
 /// The things of a scene in the set views of `scene`, whose cameras are `cameras`.
 ///

@@ -22,7 +22,7 @@ mod _splatvk {
     #[pymodule_export]
     use crate::edit::{Editor, Selection};
     #[pymodule_export]
-    use crate::scene::{Scene, load, options, reconstruct, reconstruct_pixels};
+    use crate::scene::{Scene, load, objects, options, reconstruct, reconstruct_pixels};
     #[pymodule_export]
     use crate::work::Event;
     use pyo3::prelude::*;

@@ -51,3 +51,36 @@ def test_refusals_change_nothing(copy):
     with pytest.raises(splatvk.InputError, match="leaves no splat"):
         editor.delete("opacity>0")
     assert not editor.edits and not (copy / "edits.json").exists()
+
+
+def test_things_can_be_deleted_by_id(copy):
+    things = [thing for thing in splatvk.objects(copy, min_share=0) if thing["level"] == "l"]
+    editor = splatvk.Editor(copy)
+    smallest = min(things, key=lambda thing: thing["splats"])
+    assert editor.delete(f"id:{smallest['id']}") >= smallest["splats"]
+    left = [thing for thing in splatvk.objects(copy, min_share=0) if thing["id"] == smallest["id"]]
+    assert not left or left[0]["splats"] != smallest["splats"]
+    with pytest.raises(splatvk.InputError, match="no language"):
+        splatvk.objects(train_only(copy))
+
+
+def train_only(copy):
+    """The scene without its language."""
+    manifest = json.loads((copy / "scene.json").read_text())
+    manifest.pop("language")
+    (copy / "scene.json").write_text(json.dumps(manifest))
+    return copy
+
+
+def test_label(scene, tmp_path):
+    scene.save(tmp_path / "foreign.ply")
+    cameras = scene.path / "cameras"
+    labelled = splatvk.label(
+        tmp_path / "foreign.ply",
+        images=cameras / "images",
+        cameras=cameras / "transforms.json",
+        out=tmp_path / "labelled",
+        max_size=160,
+    )
+    assert labelled.has_language and np.array_equal(labelled.means, scene.means)
+    assert (tmp_path / "labelled" / "scene.json").exists()

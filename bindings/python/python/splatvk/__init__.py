@@ -72,7 +72,9 @@ __all__ = [
     "__version__",
     "close_device",
     "device_name",
+    "label",
     "load",
+    "objects",
     "reconstruct",
     "train",
 ]
@@ -163,3 +165,68 @@ def train(images, cameras, *, out, views=None, progress=False, **options):
     return reconstruct(
         images, out=out, views=views, language=False, progress=progress, init=init, **options
     )
+
+
+def label(
+    splats,
+    *,
+    out,
+    images=None,
+    cameras=None,
+    synthesize=None,
+    views=None,
+    queries=(),
+    progress=False,
+    **options,
+):
+    """Gives splats of any program language, as `splatvk label`. Their numbers do not change.
+
+    Parameters
+    ----------
+    splats : path
+        A file of Gaussians, or a scene directory.
+    images, cameras : path, optional
+        Photos of the training with their cameras, or cameras alone to render from. Without both,
+        views are placed in free space.
+    synthesize : int, optional
+        How many views are rendered.
+    out, views, queries, progress, **options
+        As in `reconstruct`.
+
+    Returns
+    -------
+    Scene
+    """
+    plan = {
+        "inputs": [] if images is None else [_os.fspath(images)],
+        "out": _os.fspath(out),
+        "splats": _os.fspath(splats),
+        "synthesize": synthesize,
+        "queries": list(queries),
+        "views": views,
+        **dict.fromkeys(_SOURCES, "auto"),
+        "init": "sfm" if cameras is None else f"cameras:{_os.fspath(cameras)}",
+        "depth_prior": "none",
+        **options,
+    }
+    return _splatvk.reconstruct(_json.dumps(plan), _progress.observer(progress))
+
+
+def objects(scene, *, vocabulary=None, min_share=None, device=None, models=None):
+    """The things of a scene, as `splatvk objects`.
+
+    Parameters
+    ----------
+    scene : path
+        A scene directory with language; its edits apply.
+    vocabulary : sequence of str, optional
+        Names to choose from; without it those of the text model.
+    min_share : float, optional
+        Smallest share of the opacity of the scene that is a thing.
+
+    Returns
+    -------
+    list of dict
+        The entries of objects.json: id, level, parent, name, boxes in scene units and in metres.
+    """
+    return _json.loads(_splatvk.objects(_os.fspath(scene), vocabulary, min_share, device, models))

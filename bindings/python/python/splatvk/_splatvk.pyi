@@ -24,6 +24,7 @@ __all__ = [
     "device_name",
     "load",
     "main",
+    "objects",
     "options",
     "reconstruct",
     "reconstruct_pixels",
@@ -194,6 +195,13 @@ class Editor:
 def load(
     path: _Path, device: str | None = None, models: _Path | None = None, edits: bool = True
 ) -> Scene: ...
+def objects(
+    path: _Path,
+    vocabulary: Sequence[str] | None = None,
+    min_share: float | None = None,
+    device: str | None = None,
+    models: _Path | None = None,
+) -> str: ...
 def reconstruct(plan: str, observer: Callable[[Event], object]) -> Scene: ...
 def reconstruct_pixels(
     plan: str, photos: Sequence[tuple[str, _Floats]], observer: Callable[[Event], object]
