@@ -92,7 +92,7 @@ fn told(args: &RenderArgs, files: &[std::path::PathBuf], about: &About) -> Resul
     }
 }
 
-/// What was rendered.
+/// Figures of a rendered film.
 struct About {
     frames: usize,
     /// Angle of an orbit.

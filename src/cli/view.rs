@@ -31,7 +31,7 @@ pub fn view(args: &ViewArgs) -> Result<()> {
     Shown::open(*port, content)?.serve(device.json)
 }
 
-/// What a page is made of.
+/// Content of a page.
 #[derive(Clone, Copy)]
 pub struct Content<'a> {
     /// The scene.

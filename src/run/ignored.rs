@@ -3,7 +3,7 @@
 use super::ask;
 use super::config::{LanguageConfig, ReconstructionConfig};
 use super::sources::{self, FeatureSources, GraphBuilder, MaskSources, PosedPhotos};
-use super::stages::{FindByNetwork, FindByWords, GivenGeometry, UnplacedPhotos};
+use super::stages::{FindByNetwork, FindByWords, GivenGeometry, GivenPhotos};
 use crate::gpu::Device;
 use crate::infer::Registry;
 use crate::infer::installed::{Installed, Task, inventory};
@@ -173,7 +173,7 @@ fn find(
         // Before the networks look at the photos.
         None => known(&config, &language, registry)?,
     };
-    let placed = build.graph.add(UnplacedPhotos::new(photos.to_vec()), ());
+    let placed = build.graph.add(GivenPhotos::unplaced(photos.to_vec()), ());
     let (found, by) = match network {
         Some(network) => {
             let by = network.name.clone();

@@ -68,8 +68,8 @@ enum SceneOrigin {
 }
 
 impl LiveScene {
-    /// Loads a scene directory with its edits, or a file of Gaussians without language; the text encoder comes
-    /// from `registry`.
+    /// Loads a scene directory with its edits, or a file of Gaussians without language; the text
+    /// encoder comes from `registry`.
     pub fn load(device: &Device, path: &Path, registry: &Registry) -> Result<LiveScene> {
         LiveScene::loaded(device, scene_dir::load(path)?, registry)
     }

@@ -176,8 +176,8 @@ impl Viewer {
         Ok(self)
     }
 
-    /// Hatches [`DecodedFrame::picture`] where the scene shows nothing in front of these splats, which
-    /// edits took away.
+    /// Hatches [`DecodedFrame::picture`] where the scene shows nothing in front of these splats. Edits
+    /// took them away.
     pub fn with_holes(mut self, holes: &Splats) -> Result<Self> {
         if !holes.is_empty() {
             self.holes = Some(Renderer::new(&self.device, holes, &[], 0)?);

@@ -18,7 +18,7 @@ if (!installed()) {
   process.exit(0);
 }
 
-/// Camera at the start, OpenCV axes: position, a point ahead, and the vertical field of view in degrees.
+/// First camera, OpenCV axes: position, a point ahead, vertical field of view in degrees.
 const camera = JSON.parse(await readFile(join(folder, "camera.json"), "utf8"));
 
 const three = (body) => `<!doctype html><meta charset="utf-8"><style>body { margin: 0; overflow: hidden } canvas, #root { width: 100vw; height: 100vh; display: block }</style>

@@ -9,7 +9,7 @@ const kinds = new Map([["colour", ["colour"]], ["depth", ["depth"]], ["relevancy
 
 const isOff = (name) => ["0", "no", "false", "off"].includes(given.get(name));
 
-/// What has to hold before the first picture: hidden controls, guesses and notes.
+/// State that holds before the first picture: hidden controls, guesses and notes.
 export function early({ showNotes }) {
   root.classList.toggle("bare", isOff("ui"));
   if (isOff("guessed")) state.guessed = false;

@@ -159,7 +159,7 @@ pub struct Presented {
     pub total: usize,
 }
 
-/// What a served page is told of its server.
+/// Data of a served page about its server.
 #[derive(Clone, Copy, Debug)]
 pub struct Served<'a> {
     /// Reason why questions are not answered, if they are not.

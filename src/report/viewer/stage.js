@@ -52,7 +52,7 @@ export function replace(splats) {
   moved();
 }
 
-/// Takes a sorted order; one that was requested before the scene.splats changed belongs to the old ones.
+/// Takes a sorted order; one requested before `scene.splats` changed belongs to the old ones.
 function sorted(data) {
   waiting = false;
   if (next && data.id > next.after) {

@@ -83,7 +83,7 @@ fn floaters_are_in_front_of_surfaces() {
     };
     let mut scene = Scene::default();
     scene.cameras = vec![camera("a", 0.0), camera("b", 0.5), camera("c", 1.0)];
-    // On the surface at depth 2; in front of it in all views; on a nearer thing in view b only, and in
+    // On the surface at depth 2; in front of it in all views; on a nearer thing in view b, and in
     // front of the surface in the others; behind; outside of every view.
     scene.splats = splats(
         &[[0.5, 0.0, 2.0], [0.5, 0.0, 1.5], [0.5, 0.3, 1.5], [0.5, 0.0, 3.0], [50.0, 0.0, 1.0]],

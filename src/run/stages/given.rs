@@ -10,6 +10,7 @@ use crate::photo::Photo;
 use crate::pipeline::{Context, Lane, Output, Stage};
 use crate::pose::Geometry;
 use crate::scene::{Splats, Up};
+use rayon::prelude::*;
 
 /// Splats, and pictures of them with cameras and rendered depth.
 pub struct GivenViews {
@@ -44,6 +45,12 @@ impl GivenPhotos {
         let pictures: Vec<String> = photos.iter().map(identity).collect();
         let settings = format!("{} {pictures:?} {:?}", views.identity, geometry.cameras);
         GivenPhotos { photos, geometry, settings }
+    }
+
+    /// Photos before their cameras are estimated, for the stages of masks and features.
+    pub fn unplaced(photos: Vec<Photo>) -> GivenPhotos {
+        let identities: Vec<String> = photos.par_iter().map(identity).collect();
+        GivenPhotos { photos, geometry: Geometry::default(), settings: format!("{identities:?}") }
     }
 }
 

@@ -1,51 +1,18 @@
 //! Photos and texts → the pixels of the things that the texts name.
-use super::cameras::{KnownGeometry, PlacedPhotos, identity};
+use super::cameras::PlacedPhotos;
 use super::language::SharedEncoder;
 use super::shared;
 use crate::Result;
 use crate::infer::concepts::Concepts;
 use crate::infer::installed::Installed;
 use crate::language::ViewMasks;
-use crate::photo::Photo;
 use crate::pipeline::{Context, Lane, Output, Stage};
-use crate::pose::Geometry;
 use crate::query::photos::{self, PhotoRegions};
 use crate::query::{QueryOptions, TextQuery};
 use crate::scene::Image;
-use rayon::prelude::*;
 
 /// Per text and photo the pixels of its things, [H, W].
 pub type FoundPixels = Vec<Vec<Image<bool>>>;
-
-/// Photos before their cameras are estimated, for the stages of masks and features.
-pub struct UnplacedPhotos {
-    photos: Vec<Photo>,
-    settings: String,
-}
-
-impl UnplacedPhotos {
-    /// Takes the photos as they were read.
-    pub fn new(photos: Vec<Photo>) -> UnplacedPhotos {
-        let identities: Vec<String> = photos.par_iter().map(identity).collect();
-        UnplacedPhotos { photos, settings: format!("{identities:?}") }
-    }
-}
-
-impl Stage for UnplacedPhotos {
-    const NAME: &'static str = "unplaced-photos";
-    const LANE: Lane = Lane::Processor;
-    type Inputs = ();
-    type Output = PlacedPhotos;
-
-    fn settings(&self) -> String {
-        self.settings.clone()
-    }
-
-    fn run(self, (): (), _: &Context) -> Result<PlacedPhotos> {
-        let known = KnownGeometry::Complete(Geometry::default());
-        Ok(PlacedPhotos { photos: self.photos, left_out: Vec::new(), known })
-    }
-}
 
 /// Things found by the features of regions.
 pub struct FindByWords {

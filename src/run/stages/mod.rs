@@ -16,7 +16,7 @@ pub use added::{AddedCameras, AddedDepth, AlignAdded, KnownUp, OnlyAdded, OnlyAd
 pub use answers::{AnswerQueries, DecodeViews};
 pub use cameras::{CameraOrigin, Cameras, DenseDepth, KnownGeometry, PlacedPhotos, Upright};
 pub use given::{GivenGeometry, GivenPhotos, GivenSplats, GivenViews, LiftLanguage, ReprojectedMatches};
-pub use ignored::{FindByNetwork, FindByWords, UnplacedPhotos};
+pub use ignored::{FindByNetwork, FindByWords};
 pub use language::{Align, EmbedQueries, NameCodes, SharedEncoder, TrainLanguage};
 pub use masks::{
     ContourMaps, GivenMasks, GraphMasks, MasksOrFallback, NetworkMasks, RegionFeatures, SurfaceFeatures,

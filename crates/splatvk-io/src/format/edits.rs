@@ -275,10 +275,10 @@ impl EditList {
         }
     }
 
-    /// Writes the list into the directory of a scene, whole or not at all, where it follows `before`.
+    /// Writes the list into the directory of a scene where it follows `before`, whole or not at all.
     ///
     /// # Errors
-    /// A folder that cannot be written, and a list there that is not `before`: another program edits
+    /// A folder that cannot be written, and a list there other than `before`: another program edits
     /// the scene.
     pub fn replace(&self, before: &EditList, scene: &Scene) -> Result<()> {
         write_whole_file(&scene.path.join(FILE), |file| match EditList::read(&scene.path, &scene.splats)? {

@@ -244,7 +244,7 @@ pub fn write_world(path: &Path, world: &World) -> Result<()> {
     super::write_whole_file(&path.join(MANIFEST), |file| super::write_json(file, &manifest))
 }
 
-/// Loads a scene directory with its edits, or a file of Gaussians ([`gaussians::read`]), which has no
+/// Loads a scene directory with its edits, or a file of Gaussians ([`gaussians::read`]) without
 /// cameras.
 pub fn load(path: &Path) -> Result<Scene> {
     let scene = load_unedited(path)?;

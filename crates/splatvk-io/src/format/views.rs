@@ -102,7 +102,7 @@ impl NamedView {
 /// A text at a point of the scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Note {
-    /// What it says.
+    /// Its words.
     pub text: String,
     /// The point, in the scene's axes and unit.
     pub at: [f64; 3],

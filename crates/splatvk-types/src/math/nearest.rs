@@ -46,8 +46,8 @@ impl<'a> Nearest<'a> {
         }
     }
 
-    /// The K nearest points other than `skip` with their squared distances, nearest first; `None` for
-    /// missing ones.
+    /// The K nearest points other than `skip` with their squared distances, nearest first; `None`
+    /// for missing ones.
     pub fn of<const K: usize>(&self, query: Vec3, skip: Option<usize>) -> [Option<(usize, f32)>; K] {
         let mut best = [(u32::MAX, f32::INFINITY); K];
         let skip = skip.map_or(u32::MAX, |i| i as u32);
