@@ -14,7 +14,7 @@ use splatvk::format::scene_dir;
 use splatvk::gpu;
 use splatvk::pass::metrics::psnr;
 use splatvk::query::{QueryOptions, instances::splat_codes};
-use splatvk::report::viewer::Scene3d;
+use splatvk::report::viewer::{Layers, Scene3d};
 use splatvk::run::ask::QueryScene;
 use splatvk::run::metric::{self, Length};
 use splatvk::run::sources;
@@ -347,9 +347,7 @@ fn static_page_answers_stored_queries() {
     let seen = Seen { pixels: things.iter().map(|k| f32::from(u8::from(*k != Some(7)))).collect() };
     let view = Scene3d {
         title: "static",
-        splats: &scene.splats,
-        seen: &seen,
-        backdrop: &Default::default(),
+        layers: Layers { seen: &seen, ..Layers::from(&scene) },
         cameras: &scene.cameras,
         world: &scene.world,
         photos: Vec::new(),

@@ -216,12 +216,13 @@ fn listing(list: &EditList) -> String {
     if list.edits.is_empty() && list.undone.is_empty() {
         return "no edits\n".to_owned();
     }
-    let row = |(k, e): (usize, &Edit)| {
-        format!("{:>3}. {} {}: {} splats\n", k + 1, name(&e.operation), texts(&e.selection), e.splats.count())
-    };
+    let row = |(k, e): (usize, &Edit)| format!("{:>3}. {}\n", k + 1, entry(e));
     let edits: String = list.edits.iter().enumerate().map(row).collect();
-    let undone = list.undone.iter().rev();
-    let undone: String =
-        undone.map(|e| format!("  undone: {} {}\n", name(&e.operation), texts(&e.selection))).collect();
+    let undone: String = list.undone.iter().rev().map(|e| format!("  undone: {}\n", entry(e))).collect();
     edits + &undone
+}
+
+/// An edit in a line.
+pub fn entry(edit: &Edit) -> String {
+    format!("{} {}: {} splats", name(&edit.operation), texts(&edit.selection), edit.splats.count())
 }

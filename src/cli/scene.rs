@@ -14,6 +14,12 @@ pub fn load(path: &Path, edits: EditUse) -> Result<Scene> {
         true => scene_dir::load_unedited(path)?,
         false => scene_dir::load(path)?,
     };
+    remark(path, &scene);
+    Ok(scene)
+}
+
+/// Prints the warnings of a scene and the number of its edits.
+pub fn remark(path: &Path, scene: &Scene) {
     if let Some(edits) = &scene.edits {
         let noun = if edits.count == 1 { "edit" } else { "edits" };
         progress::reporter().inform(&format!(
@@ -23,7 +29,6 @@ pub fn load(path: &Path, edits: EditUse) -> Result<Scene> {
         ));
     }
     scene.warnings.iter().for_each(|note| progress::print_warning(note));
-    Ok(scene)
 }
 
 /// Photos of a scene's cameras. They are optional: a scene without its images, or with images

@@ -1,5 +1,5 @@
-//! HTTP server of `splatvk view`: one page with its data, and questions, for the browser of the
-//! user who started it.
+//! HTTP server of `splatvk view`: one page with its data, questions and edits, for the browser of
+//! the user who started it.
 //!
 //! It must withstand requests of any process of this machine: other pages of the same browser,
 //! other users, requests that never end. All connections share one thread that blocks on none of
@@ -32,6 +32,8 @@ use tokio::time::{sleep, timeout};
 const MAX_BODY: usize = 4096;
 /// Maximum size of views and notes, bytes: as many as a file may hold fit.
 const MAX_VIEWS: usize = 512 << 10;
+/// Maximum size of a selection or an edit, bytes: a hundred outlines of a hundred corners.
+const MAX_EDIT: usize = 512 << 10;
 /// Maximum size of a request head, bytes; browsers send one or two thousand.
 const MAX_HEAD: usize = 32 << 10;
 /// Time limit for a request to arrive, head and body each. On one machine it takes milliseconds.
@@ -55,12 +57,20 @@ const JSON: &str = "application/json";
 /// A JSON text, or status and message of a refusal.
 pub type Answer = Result<String, (u16, String)>;
 
-/// A question with the receiver of its answer.
+/// A request that needs the scene, with the receiver of its answer.
 pub struct Question {
-    /// Text of the question, not empty.
-    pub text: String,
+    /// The request.
+    pub asks: Asks,
     /// Closed if the connection ended.
     pub reply: oneshot::Sender<Answer>,
+}
+
+/// Request that needs the scene.
+pub enum Asks {
+    /// A query of a text, not empty.
+    Text(String),
+    /// A selection or an edit, JSON.
+    Edit(Bytes),
 }
 
 /// Content of the server, which may change.
@@ -73,6 +83,8 @@ pub struct Site {
     pub scene: Vec<u8>,
     /// Whether questions are answered.
     pub answers_questions: bool,
+    /// Whether selections are made.
+    pub selects: bool,
     /// Whether another page will follow.
     pub is_preview: bool,
     /// Scene directory whose views and notes the page may save.
@@ -206,6 +218,7 @@ struct Content {
     scene_path: &'static str,
     scene: Bytes,
     answers_questions: bool,
+    selects: bool,
     is_preview: bool,
     views: Option<PathBuf>,
     mesh: Option<Bytes>,
@@ -221,6 +234,7 @@ impl Content {
             scene_path: site.scene_path,
             scene: site.scene.into(),
             answers_questions: site.answers_questions,
+            selects: site.selects,
             is_preview: site.is_preview,
             views: site.views,
             mesh: site.mesh.map(Bytes::from),
@@ -304,11 +318,13 @@ impl Shared {
             }
             (&Method::GET | &Method::HEAD, name) => lock(&self.content).get(name).ok_or_else(not_found),
             (&Method::POST, "query") => {
-                let text = question(request).await?;
-                waits.store(true, Ordering::Relaxed);
-                let answer = self.ask(text).await;
-                waits.store(false, Ordering::Relaxed);
-                Ok((JSON, answer?.into()))
+                let asks = Asks::Text(question(request).await?);
+                self.ask(asks, waits).await.map(|answer| (JSON, answer.into()))
+            }
+            (&Method::POST, "edit") => {
+                let asks =
+                    Asks::Edit(body(request, MAX_EDIT, "a selection", "select with fewer outlines").await?);
+                self.ask(asks, waits).await.map(|answer| (JSON, answer.into()))
             }
             _ => Err(not_found()),
         }
@@ -355,17 +371,23 @@ impl Shared {
         Ok(json!(views).to_string())
     }
 
-    async fn ask(&self, text: String) -> Result<String, Refused> {
-        if !lock(&self.content).answers_questions {
-            return Err((StatusCode::NOT_FOUND, "this scene answers no questions".to_owned()));
+    async fn ask(&self, asks: Asks, waits: &AtomicBool) -> Result<String, Refused> {
+        let (is_answered, refusal) = match (&asks, &*lock(&self.content)) {
+            (Asks::Text(_), content) => (content.answers_questions, "this scene answers no questions"),
+            (Asks::Edit(_), content) => (content.selects, "this page selects and edits nothing"),
+        };
+        if !is_answered {
+            return Err((StatusCode::NOT_FOUND, refusal.to_owned()));
         }
         let busy = |message: &str| (StatusCode::SERVICE_UNAVAILABLE, message.to_owned());
         let (reply, answer) = oneshot::channel();
         self.questions
-            .try_send(Question { text, reply })
+            .try_send(Question { asks, reply })
             .map_err(|_| busy("too many questions at once; ask again in a moment"))?;
-        let answer = answer.await.map_err(|_| busy("the server is about to end"))?;
-        answer.map_err(|(status, message)| {
+        waits.store(true, Ordering::Relaxed);
+        let answer = answer.await.map_err(|_| busy("the server is about to end"));
+        waits.store(false, Ordering::Relaxed);
+        answer?.map_err(|(status, message)| {
             (StatusCode::from_u16(status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR), message)
         })
     }

@@ -1,19 +1,19 @@
 //! `splatvk view`: the interactive view of a scene, served to the browser of this machine.
+mod backend;
+
 use super::args::{DeviceArgs, EditUse, ViewArgs};
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
-use super::serve::{Answer, ServerAddress, Site, serve};
+use super::serve::{ServerAddress, Site, serve};
 use crate::format::scene_dir::Scene;
-use crate::gpu;
-use crate::query::QueryOptions;
-use crate::report::viewer::{self, CodeNames, Lifetime, Packed, SCENE_PATH, Scene3d, Served};
+use crate::report::viewer::{self, CodeNames, Lifetime, SCENE_PATH, Scene3d, Served};
 use crate::run::Compat;
-use crate::run::ask::QueryScene;
-use crate::run::encoder;
+use crate::run::edit::Editor;
 use crate::run::preview;
 use crate::run::record;
 use crate::{Error, Result, files};
+use backend::Backend;
 use serde_json::json;
 use std::path::Path;
 use std::sync::mpsc::RecvTimeoutError;
@@ -60,7 +60,8 @@ pub struct Shown<'a> {
 /// A site, and the state behind it.
 struct Prepared {
     site: Site,
-    ready: Option<QueryScene>,
+    /// `None` for a preview.
+    backend: Option<Backend>,
     /// Time stamp of a preview; `None` for a finished scene.
     preview: Option<SystemTime>,
 }
@@ -87,8 +88,7 @@ impl<'a> Shown<'a> {
     pub fn serve(self, as_json: bool) -> Result<()> {
         let Shown { content, server, before, prepared } = self;
         let path = content.path;
-        let Prepared { site, mut ready, mut preview } = prepared;
-        let options = Compat::answers(None, path)?;
+        let Prepared { site, mut backend, mut preview } = prepared;
         let (address, answers) = (server.url(), site.answers_questions);
         let (questions, live) = serve(server, site)?;
         // From here on stopping leaves nothing undone. Whoever reads the address may stop the
@@ -109,7 +109,8 @@ impl<'a> Shown<'a> {
                 // The page was closed while its question waited.
                 Ok(question) if question.reply.is_closed() => {}
                 Ok(question) => {
-                    let answer = reply(ready.as_mut(), &question.text, &options);
+                    let none = || Err((404, "the scene is still being made".to_owned()));
+                    let answer = backend.as_mut().map_or_else(none, |b| b.answer(&question.asks, &live));
                     let _ = question.reply.send(answer);
                 }
                 Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => {}
@@ -122,8 +123,10 @@ impl<'a> Shown<'a> {
                 Some(stamp) if Some(stamp) == preview => {}
                 Some(stamp) => {
                     // A preview that is replaced at this moment comes with the next look.
-                    let packed = preview::of_running(path)
-                        .map(|p| scene::load(&p, content.edits).and_then(|s| pack(&s, content.budget)));
+                    let packed = preview::of_running(path).map(|preview| {
+                        let scene = scene::load(&preview, content.edits)?;
+                        viewer::pack((&scene).into(), None, content.budget)
+                    });
                     if let Some(Ok(packed)) = packed {
                         live.renew(packed.bytes);
                         preview = Some(stamp);
@@ -133,7 +136,7 @@ impl<'a> Shown<'a> {
                 None if written(path).is_some_and(|time| Some(time) != before) => {
                     let last = Prepared::load(content)?;
                     live.replace(last.site);
-                    (ready, preview) = (last.ready, last.preview);
+                    (backend, preview) = (last.backend, last.preview);
                 }
                 None => live.say("The run ended without a scene; this is its last preview."),
             }
@@ -160,54 +163,70 @@ impl Prepared {
         // The run may end at this moment and take its preview away.
         let running = preview.and_then(|_| scene::load(&preview::of_running(path)?, edits).ok());
         let preview = preview.filter(|_| running.is_some());
-        let scene = running.map_or_else(|| scene::load(path, edits), Ok)?;
-        if scene.splats.is_empty() {
+        let is_fixed = running.is_some() || edits.ignore_edits || path.is_file();
+        let mut editor = match running {
+            Some(scene) => Editor::read_only(scene, "a preview cannot be edited", &device.machine()),
+            None if is_fixed => {
+                let reason = "this page was opened without the edits of the scene, and changes none";
+                Editor::read_only(scene::load(path, edits)?, reason, &device.machine())
+            }
+            None => {
+                let editor = Editor::open(path, &device.machine())?;
+                scene::remark(path, editor.scene());
+                editor
+            }
+        };
+        if editor.scene().splats.is_empty() {
             return Err(Error::input(format!("{}: no splats to show", path.display())));
         }
-        let (mut ready, no_questions) = match query_scene(&scene, device) {
-            _ if preview.is_some() => (None, Some("words come with the finished scene".to_owned())),
-            Ok(ready) => (Some(ready), None),
-            Err(error) => (None, Some(error.to_string())),
+        let has_language = editor.scene().language.is_some();
+        let no_questions = match preview {
+            Some(_) => Some("words come with the finished scene".to_owned()),
+            None if !has_language => Some("this scene has no language".to_owned()),
+            None => editor.prepare().err().map(|error| error.to_string()),
         };
-        if let Some(reason) = no_questions.as_deref().filter(|_| scene.language.is_some()) {
+        if let Some(reason) = no_questions.as_deref().filter(|_| has_language) {
             progress::reporter().warn(&format!("no questions: {reason}"));
         }
-        let names = ready.as_mut().map_or(Ok(CodeNames::new()), QueryScene::names)?;
-        let suggested = match &ready {
-            None => Vec::new(),
-            Some(_) if suggested.is_empty() => queries_of_run(path),
-            Some(_) => suggested.to_vec(),
+        let names = if no_questions.is_none() { editor.names()? } else { CodeNames::new() };
+        let suggested = match &no_questions {
+            Some(_) => Vec::new(),
+            None if suggested.is_empty() => queries_of_run(path),
+            None => suggested.to_vec(),
         };
-        let packed = pack(&scene, budget)?;
+        let scene = editor.scene();
+        let packed = viewer::pack(scene.into(), scene.language.as_ref(), budget)?;
         let views = (preview.is_none() && path.is_dir()).then(|| path.to_owned());
         let served = Served {
             no_questions: no_questions.as_deref(),
             lifetime: if preview.is_some() { Lifetime::Preview } else { Lifetime::Final },
-            shown: packed.shown,
+            shown: packed.order.len(),
             total: packed.total,
             saves_views: views.is_some(),
+            edits: !is_fixed,
             has_mesh: mesh.is_some(),
         };
         let site = Site {
-            page: page(&scene, path, &names, suggested, &served)?,
+            page: page(scene, path, &names, suggested, &served)?,
             scene_path: SCENE_PATH,
             scene: packed.bytes,
-            answers_questions: ready.is_some(),
+            answers_questions: no_questions.is_none(),
+            selects: !is_fixed,
             is_preview: preview.is_some(),
             views,
             mesh,
         };
-        Ok(Prepared { site, ready, preview })
+        let backend = match preview {
+            Some(_) => None,
+            None => Some(Backend::new(editor, Compat::answers(None, path)?, budget, packed.order)),
+        };
+        Ok(Prepared { site, backend, preview })
     }
 }
 
 /// Queries of the run that made a scene.
 fn queries_of_run(scene: &Path) -> Vec<String> {
     record::read(scene, "").map(|record| record.config.plan.inputs.queries).unwrap_or_default()
-}
-
-fn pack(scene: &Scene, budget: usize) -> Result<Packed> {
-    viewer::pack(&scene.splats, &scene.seen, &scene.backdrop, scene.language.as_ref(), budget)
 }
 
 /// Bytes of a GLB file, which the page reads.
@@ -222,16 +241,6 @@ fn read_mesh(path: &Path) -> Result<Vec<u8>> {
     )))
 }
 
-/// Prepares the scene for questions in its own views.
-fn query_scene(scene: &Scene, device: &DeviceArgs) -> Result<QueryScene> {
-    let field = scene.language.clone().ok_or_else(|| Error::input("this scene has no language"))?;
-    let encoder = encoder::of_scene(scene, device.registry()?)?;
-    let device = gpu::open(device.device.as_deref())?;
-    let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
-    ready.set_views(&scene.cameras)?;
-    Ok(ready)
-}
-
 fn page(
     scene: &Scene,
     path: &Path,
@@ -242,17 +251,6 @@ fn page(
     let (images, title) = (scene::photos(scene), scene::title(path));
     let view = Scene3d { suggested, ..Scene3d::of(scene, &title, &images, names) };
     view.served(served)
-}
-
-fn reply(ready: Option<&mut QueryScene>, text: &str, options: &QueryOptions) -> Answer {
-    let ready = ready.ok_or_else(|| (404, "this scene answers no questions".to_owned()))?;
-    let clock = Instant::now();
-    let answers = ready
-        .ask(text, options)
-        .map_err(|e| (if (2..=3).contains(&e.exit_code()) { 422 } else { 500 }, e.to_string()))?;
-    let mut reply = answers.shown().json();
-    reply["milliseconds"] = (1e3 * clock.elapsed().as_secs_f64()).into();
-    Ok(reply.to_string())
 }
 
 /// Detects that the parent of this process is gone, by a closed terminal or pipe. Nothing is read.

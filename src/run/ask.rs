@@ -230,6 +230,11 @@ impl QueryScene {
         self.session.encoder.as_ref()
     }
 
+    /// The text encoder, for another scene.
+    pub fn into_encoder(self) -> Box<dyn RegionEncoder> {
+        self.session.encoder
+    }
+
     /// The scene's language.
     pub fn field(&self) -> &LanguageField {
         &self.field

@@ -20,7 +20,7 @@ use crate::photo;
 use crate::progress::Silent;
 use crate::query::QueryOptions;
 use crate::query::phrasing::Reading;
-use crate::report::viewer::{CodeNames, Scene3d};
+use crate::report::viewer::{CodeNames, Layers, Scene3d};
 use crate::scene::{Camera, LanguageField, Seen, Splats, World};
 use crate::{Error, Result};
 use std::path::Path;
@@ -213,9 +213,10 @@ impl LiveScene {
     /// page ([`Scene3d::framed`]).
     pub fn page(&self, title: &str, most: usize, asks: bool) -> Result<String> {
         let none = CodeNames::new();
-        let backdrop = match &self.origin {
-            SceneOrigin::Trained(o) => &o.backdrop,
-            SceneOrigin::Loaded(s) => &s.backdrop,
+        let no_holes = Splats::default();
+        let (holes, backdrop) = match &self.origin {
+            SceneOrigin::Trained(o) => (&no_holes, &o.backdrop),
+            SceneOrigin::Loaded(s) => (&s.holes, &s.backdrop),
         };
         let names = match &self.origin {
             SceneOrigin::Trained(o) => o.language.as_ref().map_or(&none, |l| &l.names),
@@ -223,9 +224,7 @@ impl LiveScene {
         };
         let scene = Scene3d {
             title,
-            splats: self.splats(),
-            seen: self.seen(),
-            backdrop,
+            layers: Layers { splats: self.splats(), seen: self.seen(), holes, backdrop },
             cameras: self.cameras(),
             world: self.world(),
             photos: Vec::new(),

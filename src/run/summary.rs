@@ -9,11 +9,12 @@ use crate::infer::words;
 use crate::photo::Photo;
 use crate::pose::{Confidence, Fitted};
 use crate::query::presence::Presence;
-use crate::report::viewer::{CodeNames, Scene3d};
+use crate::report::viewer::{CodeNames, Layers, Scene3d};
 use crate::report::{self, AnswerShown, Certainty, Figure, HtmlReport, QueryShown, ViewShown};
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, Seen, Splats, World};
 use rayon::prelude::*;
 use std::path::Path;
+use std::sync::LazyLock;
 
 /// A line for every photo that joined a scene.
 fn added_figures(o: &RunOutcome) -> Vec<Figure> {
@@ -289,13 +290,18 @@ pub(super) fn write(folder: &Path, o: &RunOutcome) -> Result<()> {
 
 /// Names of codes for scenes without language.
 static NO_NAMES: CodeNames = Vec::new();
+/// Holes of scenes that are made: they have no edits.
+static NO_SPLATS: LazyLock<Splats> = LazyLock::new(Splats::default);
 
 fn scene<'a>(title: &'a str, photos: &'a [RgbImage], o: &'a RunOutcome) -> Scene3d<'a> {
     Scene3d {
         title,
-        splats: &o.splats,
-        seen: &o.seen,
-        backdrop: &o.backdrop,
+        layers: Layers {
+            splats: &o.splats,
+            seen: &o.seen,
+            holes: &NO_SPLATS,
+            backdrop: &o.backdrop,
+        },
         cameras: &o.cameras,
         world: &o.world,
         photos: photos.iter().collect(),

@@ -158,6 +158,13 @@ export class Camera {
     [this.cover, this.shift] = [0, [0, 0]];
   }
 
+  /// The camera of a picture of this size as a JSON object of the server: OpenCV axes, the rotation
+  /// from world to camera in columns.
+  stated(width, height) {
+    const [fx, fy, cx, cy] = this.intrinsics(width, height);
+    return { name: "view", width, height, fx, fy, cx, cy, pose: { rotation: transpose(this.rotation), translation: this.translation } };
+  }
+
   /// Pixel position and depth of a world point.
   project(point, width, height) {
     const t = rotate(this.rotation, sub(point, this.position));

@@ -4,9 +4,10 @@
 /// place, and movement up to which a press is a tap.
 const DOUBLE = 250, SAME = 12, STEADY = 4;
 
+/// Creates a button; attributes that are false are left out.
 export function button(text, act, attributes = {}) {
   const made = Object.assign(document.createElement("button"), { type: "button", textContent: text, onclick: act });
-  Object.entries(attributes).forEach(([name, value]) => made.setAttribute(name, value));
+  Object.entries(attributes).filter(([, value]) => value !== false).forEach(([name, value]) => made.setAttribute(name, value));
   return made;
 }
 
@@ -42,9 +43,9 @@ function zoomer({ motion, surface }) {
   };
 }
 
-function pointers({ root, canvas, motion, tap, tapsAtOnce, fills }, zoomAt) {
+function pointers({ root, canvas, motion, tap, tapsAtOnce, dragTool, fills }, zoomAt) {
   const down = new Map();
-  let start = null, first = null;
+  let start = null, first = null, tool = null;
   const middle = () => {
     const all = [...down.values()];
     const sum = all.reduce((s, p) => [s[0] + p[0] / all.length, s[1] + p[1] / all.length], [0, 0]);
@@ -73,6 +74,10 @@ function pointers({ root, canvas, motion, tap, tapsAtOnce, fills }, zoomAt) {
     canvas.setPointerCapture(e.pointerId);
     down.set(e.pointerId, [e.offsetX, e.offsetY]);
     start = down.size === 1 ? [e.offsetX, e.offsetY] : null;
+    // A second finger moves the camera instead.
+    tool?.end(false);
+    tool = start && e.button === 0 ? dragTool() : null;
+    tool?.from(...start);
   });
   canvas.addEventListener("pointermove", (e) => {
     if (!down.has(e.pointerId)) return;
@@ -81,6 +86,7 @@ function pointers({ root, canvas, motion, tap, tapsAtOnce, fills }, zoomAt) {
     const [x, y, spread] = middle();
     if (start && Math.hypot(e.offsetX - start[0], e.offsetY - start[1]) > STEADY) start = null;
     if (start) return;
+    if (tool) return tool.to(x, y);
     const height = canvas.clientHeight, by = [(x - x0) / height, (y - y0) / height];
     // The right and the middle button.
     const pans = down.size > 1 || e.buttons & 6 || (e.shiftKey && !motion.walking.size);
@@ -90,6 +96,8 @@ function pointers({ root, canvas, motion, tap, tapsAtOnce, fills }, zoomAt) {
   });
   const release = (e) => {
     down.delete(e.pointerId);
+    tool?.end(e.type === "pointerup" && !start);
+    tool = null;
     if (e.type === "pointerup" && start && e.button === 0) tapped(...start);
     start = null;
   };
@@ -114,7 +122,7 @@ function keys(view, zoomAt) {
   const table = {
     "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
     r: actions.reset, home: actions.reset, 0: actions.all, m: () => view.nextMode(1), g: view.toggleGuessed,
-    l: actions.measure, p: actions.save, v: actions.views, t: actions.mesh, f: actions.full, "?": actions.help, h: actions.help,
+    l: actions.measure, p: actions.save, v: actions.views, x: actions.edit, delete: actions.erase, backspace: actions.erase, t: actions.mesh, f: actions.full, "?": actions.help, h: actions.help,
     "/": () => root.querySelector(".v-ask input").focus(), escape: view.clear,
   };
   root.addEventListener("keydown", (e) => {
@@ -123,8 +131,12 @@ function keys(view, zoomAt) {
       if (e.key === "Escape") root.focus();
       return;
     }
-    if (e.ctrlKey || e.metaKey || e.altKey) return;
     const key = e.key.toLowerCase();
+    if ((e.ctrlKey || e.metaKey) && key === "z") {
+      e.preventDefault();
+      return e.shiftKey ? actions.redo() : actions.undo();
+    }
+    if (e.ctrlKey || e.metaKey || e.altKey) return;
     if (arrows[e.key]) {
       const [x, y] = arrows[e.key];
       if (e.shiftKey) motion.pan(-0.05 * x, -0.05 * y);

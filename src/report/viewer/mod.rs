@@ -5,7 +5,7 @@
 //! works from a file and from a server.
 mod pack;
 
-pub use pack::{Packed, pack};
+pub use pack::{Layers, Packed, pack};
 
 use super::chart::escape;
 use super::{colour, thousands};
@@ -16,7 +16,7 @@ use crate::format::views::Views;
 use crate::query::clicks::Standing;
 use crate::query::highlight::Highlight;
 use crate::query::presence::Presence;
-use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, Seen, Splats, World};
+use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, World};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
@@ -31,16 +31,18 @@ const REPORT_SPLATS: usize = 300_000;
 const THUMBNAIL: usize = 104;
 
 /// Import name and text of each module.
-const MODULES: [(&str, &str); 23] = [
+const MODULES: [(&str, &str); 26] = [
     ("splatvk/address", include_str!("address.js")),
     ("splatvk/camera", include_str!("camera.js")),
     ("splatvk/card", include_str!("card.js")),
     ("splatvk/controls", include_str!("controls.js")),
+    ("splatvk/edit", include_str!("edit.js")),
     ("splatvk/frame", include_str!("frame.js")),
     ("splatvk/measure", include_str!("measure.js")),
     ("splatvk/mesh", include_str!("mesh.js")),
     ("splatvk/motion", include_str!("motion.js")),
     ("splatvk/names", include_str!("names.js")),
+    ("splatvk/outline", include_str!("outline.js")),
     ("splatvk/page", include_str!("page.js")),
     ("splatvk/panel", include_str!("panel.js")),
     ("splatvk/pick", include_str!("pick.js")),
@@ -55,6 +57,7 @@ const MODULES: [(&str, &str); 23] = [
     ("splatvk/things", include_str!("things.js")),
     ("splatvk/views", include_str!("views.js")),
     ("splatvk/viewer", include_str!("viewer.js")),
+    ("splatvk/widgets", include_str!("widgets.js")),
 ];
 
 const MARKUP: &str = include_str!("viewer.html");
@@ -105,11 +108,7 @@ pub struct Scene3d<'a> {
     /// Name of the scene.
     pub title: &'a str,
     /// The Gaussians.
-    pub splats: &'a Splats,
-    /// Visibility of the splats in the photos.
-    pub seen: &'a Seen,
-    /// Splats behind the scene; may be empty.
-    pub backdrop: &'a Splats,
+    pub layers: Layers<'a>,
     /// Cameras of the photos.
     pub cameras: &'a [Camera],
     /// World frame of the scene.
@@ -133,9 +132,7 @@ impl<'a> Scene3d<'a> {
     pub fn of(scene: &'a Scene, title: &'a str, photos: &'a [RgbImage], names: &'a CodeNames) -> Scene3d<'a> {
         Scene3d {
             title,
-            splats: &scene.splats,
-            seen: &scene.seen,
-            backdrop: &scene.backdrop,
+            layers: scene.into(),
             cameras: &scene.cameras,
             world: &scene.world,
             photos: photos.iter().collect(),
@@ -172,6 +169,8 @@ pub struct Served<'a> {
     pub total: usize,
     /// Whether `GET views` sends the views and notes of the scene and `POST views` saves them.
     pub saves_views: bool,
+    /// Whether `POST edit` selects and edits.
+    pub edits: bool,
     /// Whether `GET mesh.glb` sends a mesh of the scene.
     pub has_mesh: bool,
 }
@@ -188,7 +187,7 @@ pub enum Lifetime {
 impl Scene3d<'_> {
     /// Section for a static page with the splats, and a note about it.
     pub fn embedded(&self) -> Result<(String, String)> {
-        let packed = pack(self.splats, self.seen, self.backdrop, self.language, REPORT_SPLATS)?;
+        let packed = pack(self.layers, self.language, REPORT_SPLATS)?;
         let data = STANDARD.encode(&packed.bytes);
         let note = format!(
             "{}, {:.1} MB in this page. splatvk view SCENE answers any question.",
@@ -203,7 +202,7 @@ impl Scene3d<'_> {
 
     /// Whole page with the splats inside, under its title.
     pub fn presented(&self) -> Result<Presented> {
-        let packed = pack(self.splats, self.seen, self.backdrop, self.language, REPORT_SPLATS)?;
+        let packed = pack(self.layers, self.language, REPORT_SPLATS)?;
         let mut manifest = self.manifest("")?;
         manifest["presented"] = true.into();
         let data = STANDARD.encode(&packed.bytes);
@@ -216,13 +215,13 @@ impl Scene3d<'_> {
         );
         let html = self.whole_page(&manifest, &splats);
         let html = html.replacen(TOP, &format!("{TOP}{caption}"), 1);
-        Ok(Presented { html, shown: packed.shown, total: packed.total })
+        Ok(Presented { html, shown: packed.order.len(), total: packed.total })
     }
 
     /// Whole page with at most `most` splats inside, for a frame in another page; with `asks` it
     /// sends questions to that page, which answers them.
     pub fn framed(&self, most: usize, asks: bool) -> Result<String> {
-        let packed = pack(self.splats, self.seen, self.backdrop, self.language, most)?;
+        let packed = pack(self.layers, self.language, most)?;
         let mut manifest =
             self.manifest("This view answers no questions; ask in Python: scene.query(text).")?;
         manifest["live"] = asks.into();
@@ -241,6 +240,7 @@ impl Scene3d<'_> {
         manifest["renews"] = (server.lifetime == Lifetime::Preview).into();
         manifest["shown"] = server.shown.into();
         manifest["total"] = server.total.into();
+        manifest["edits"] = server.edits.into();
         manifest["saves"] = server.saves_views.into();
         manifest["mesh"] = server.has_mesh.into();
         Ok(self.whole_page(&manifest, ""))
@@ -259,13 +259,13 @@ impl Scene3d<'_> {
 
     fn manifest(&self, ask_note: &str) -> Result<Value> {
         let views = self.cameras.iter().enumerate().map(|(i, c)| view(c, self.photos.get(i).copied()));
-        let standing = self.language.map(|l| Standing::of(self.splats, l, self.cameras)).unwrap_or_default();
+        let standing = self.language.map(|l| Standing::of(self.layers.splats, l, self.cameras)).unwrap_or_default();
         let words = self.language.is_some_and(|l| l.space.starts_with("words"));
         Ok(json!({
             "title": self.title, "live": false, "ask_note": ask_note,
             "names_note": if words { "" } else { "This text model brings no phrases of its own: ask, and they appear here." },
             "views": views.collect::<Result<Vec<_>>>()?,
-            "unseen": self.seen.unseen() + self.backdrop.len(),
+            "unseen": self.layers.seen.unseen() + self.layers.backdrop.len(),
             "metres": self.world.scale.as_ref().map(|s| s.metres_per_unit),
             "up": self.world.up.as_ref().map(|u| u.direction.to_array()),
             "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at, &standing)).collect::<Vec<_>>(),
@@ -289,7 +289,7 @@ impl Scene3d<'_> {
 
 /// Number of shown splats, and of all where some are left out.
 fn shown_of(packed: &Packed) -> String {
-    match (packed.shown, packed.total) {
+    match (packed.order.len(), packed.total) {
         (shown, total) if shown < total => format!("{} of {} splats", thousands(shown), thousands(total)),
         (shown, _) => format!("{} splats", thousands(shown)),
     }
@@ -336,8 +336,7 @@ fn section(manifest: &Value, data: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Scale;
-    use crate::scene::seeded;
+    use crate::scene::{Scale, Seen, Splats, seeded};
 
     /// The page stays small enough to be sent: code, style and markup, compressed.
     #[test]
@@ -373,9 +372,12 @@ mod tests {
         let scale = Scale { metres_per_unit: 0.25, log_sigma: 0.1, stated: Vec::new() };
         let scene = Scene3d {
             title: "a<b",
-            splats: &splats,
-            seen: &Seen::default(),
-            backdrop: &Splats::default(),
+            layers: Layers {
+                splats: &splats,
+                seen: &Seen::default(),
+                holes: &Splats::default(),
+                backdrop: &Splats::default(),
+            },
             cameras: std::slice::from_ref(&camera),
             world: &World { scale: Some(scale), ..World::default() },
             photos: vec![&photo],
@@ -403,6 +405,7 @@ mod tests {
             shown: 40,
             total: 50,
             saves_views: false,
+            edits: false,
             has_mesh: false,
         };
         let page = scene.served(&server).unwrap();

@@ -5,7 +5,7 @@
 //!
 //! | field | type | meaning |
 //! |---|---|---|
-//! | head | `SVKVIEW1`, u32 × 4 | N, SH degree, L, flags (1: unseen present, 2: antialiased) |
+//! | head | `SVKVIEW1`, u32 × 4 | N, SH degree, L, flags (1: kinds present, 2: antialiased) |
 //! | SH scale | f32 × 3 | largest absolute coefficient of degrees 1, 2, 3 |
 //! | ranges | f32 × 10 per block | lowest and highest x, y, z; log scale; colour |
 //! | x, y, z | u16 × N each | position in the block's range |
@@ -15,11 +15,12 @@
 //! | red, green, blue | u8 × N each | 0.5 + SH₀ · DC in the block's range |
 //! | SH rest | i8 × N, 3 R times | coefficient by coefficient, RGB; 127 = the scale of its degree |
 //! | codes | u16 × N, L times | code + 1 per level, finest first; 0 = none |
-//! | unseen | u8 × N | 1 where no photo shows the splat |
+//! | kinds | u8 × N | sum of 1: no photo shows it, 2: of a [hole](Layers::holes), 4: of the backdrop |
 //!
 //! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block,
 //! which is a few neighbouring splats wide.
 use crate::math::{quaternion_norm, sigmoid};
+use crate::format::scene_dir::Scene;
 use crate::query::instances;
 use crate::scene::{LanguageField, LevelField, SH_C0, Seen, Splats};
 use crate::{Error, Result};
@@ -32,36 +33,59 @@ const BLOCK: usize = 256;
 /// Least opacity of a drawn splat (docs/internals/method.md#forward-rasterisation).
 const MIN_ALPHA: f32 = 1.0 / 255.0;
 
+/// Bits of the plane of kinds.
+const UNSEEN: u8 = 1;
+const HOLE: u8 = 2;
+const BACKDROP: u8 = 4;
+
+/// Splats of a page, each layer in front of the next.
+#[derive(Clone, Copy, Debug)]
+pub struct Layers<'a> {
+    /// The scene.
+    pub splats: &'a Splats,
+    /// Visibility of its splats in the photos; unknown ones count as seen.
+    pub seen: &'a Seen,
+    /// Splats that edits took away: a page hatches them behind the scene.
+    pub holes: &'a Splats,
+    /// Splats behind all others.
+    pub backdrop: &'a Splats,
+}
+
+impl<'a> From<&'a Scene> for Layers<'a> {
+    fn from(scene: &'a Scene) -> Layers<'a> {
+        let Scene { splats, seen, holes, backdrop, .. } = scene;
+        Layers { splats, seen, holes, backdrop }
+    }
+}
+
 /// A packed scene.
 pub struct Packed {
     /// Gzip stream.
     pub bytes: Vec<u8>,
-    /// Number of packed splats.
-    pub shown: usize,
-    /// Number of splats of the scene.
+    /// Index of every packed splat in the scene, its holes and its backdrop, one after the other.
+    pub order: Vec<usize>,
+    /// Number of splats of the scene, those of holes and backdrop included.
     pub total: usize,
 }
 
-/// Packs at most `most` splats, those of the largest opacity times area. The `backdrop` counts as
-/// unseen.
-pub fn pack(
-    splats: &Splats,
-    seen: &Seen,
-    backdrop: &Splats,
-    language: Option<&LanguageField>,
-    most: usize,
-) -> Result<Packed> {
-    let (mut all, mut visible) = (splats.clone(), seen.clone());
-    if !backdrop.is_empty() {
-        all.append_raised(backdrop.clone());
-        // Splats of unknown visibility count as seen.
-        visible.pixels.resize(splats.len(), f32::MAX);
-        visible.pixels.resize(all.len(), 0.0);
+/// Packs at most `most` splats, those of the largest opacity times area.
+pub fn pack(layers: Layers, language: Option<&LanguageField>, most: usize) -> Result<Packed> {
+    let Layers { splats, seen, holes, backdrop } = layers;
+    let mut all = splats.clone();
+    for more in [holes, backdrop].into_iter().filter(|more| !more.is_empty()) {
+        all.append_raised(more.clone());
     }
+    let own = splats.len();
+    let kind = |i: usize| match i {
+        _ if i < own => u8::from(seen.is_unseen(i)) * UNSEEN,
+        _ if i < own + holes.len() => HOLE,
+        _ => BACKDROP | UNSEEN,
+    };
     let order = morton_order(&all, most_visible(&all, most));
     let levels: Vec<&LevelField> = language.map_or(Vec::new(), |f| f.levels.iter().collect());
-    let raw = write(&all, &visible, &levels, &order);
-    Ok(Packed { bytes: gzip(&raw)?, shown: order.len(), total: all.len() })
+    let kinds: Vec<u8> = order.iter().map(|i| kind(*i)).collect();
+    let raw = write(&all, &kinds, &levels, &order);
+    Ok(Packed { bytes: gzip(&raw)?, order, total: all.len() })
 }
 
 /// Bytes that are deflated as one part: parts cannot refer to each other, which costs a window of
@@ -152,7 +176,7 @@ fn bounds<const K: usize>(rows: impl Iterator<Item = [f32; K]>) -> ([f32; K], [f
     })
 }
 
-fn write(splats: &Splats, seen: &Seen, levels: &[&LevelField], order: &[usize]) -> Vec<u8> {
+fn write(splats: &Splats, kinds: &[u8], levels: &[&LevelField], order: &[usize]) -> Vec<u8> {
     let rest = splats.sh_len() - 1;
     let colour = |i: usize| [0, 1, 2].map(|c| 0.5 + SH_C0 * splats.sh[3 * (rest + 1) * i + c]);
     let all = |i: usize| {
@@ -176,7 +200,8 @@ fn write(splats: &Splats, seen: &Seen, levels: &[&LevelField], order: &[usize]) 
     };
     let scales = sh_scales(splats, order, rest);
     let mut out = MAGIC.to_vec();
-    let flags = u32::from(seen.unseen() > 0) | u32::from(splats.antialiased) << 1;
+    let has_kinds = kinds.iter().any(|kind| *kind != 0);
+    let flags = u32::from(has_kinds) | u32::from(splats.antialiased) << 1;
     for v in [order.len() as u32, splats.sh_degree, levels.len() as u32, flags] {
         out.extend(v.to_le_bytes());
     }
@@ -205,7 +230,7 @@ fn write(splats: &Splats, seen: &Seen, levels: &[&LevelField], order: &[usize]) 
             Plane::Codes(level) => {
                 codes(levels[level], order).iter().flat_map(|code| code.to_le_bytes()).collect()
             }
-            Plane::Unseen => order.iter().map(|i| u8::from(seen.is_unseen(*i))).collect(),
+            Plane::Kinds => kinds.to_vec(),
         }
     };
     let mut planes: Vec<Plane> = (0..3).map(Plane::Position).chain((0..3).map(Plane::LogScale)).collect();
@@ -213,7 +238,7 @@ fn write(splats: &Splats, seen: &Seen, levels: &[&LevelField], order: &[usize]) 
     planes.extend((0..3).map(Plane::Colour));
     planes.extend((0..rest).flat_map(|k| (0..3).map(move |c| Plane::Rest(k, c))));
     planes.extend((0..levels.len()).map(Plane::Codes));
-    planes.extend((seen.unseen() > 0).then_some(Plane::Unseen));
+    planes.extend(has_kinds.then_some(Plane::Kinds));
     planes.into_par_iter().map(plane).collect::<Vec<_>>().iter().for_each(|plane| out.extend(plane));
     out
 }
@@ -229,7 +254,7 @@ enum Plane {
     /// Coefficient after the lowest, and channel.
     Rest(usize, usize),
     Codes(usize),
-    Unseen,
+    Kinds,
 }
 
 /// Degree of the k-th coefficient after the lowest.
@@ -323,9 +348,11 @@ mod tests {
         let field = LanguageField { levels: vec![level, LevelField::default()], space: String::new() };
         let order = morton_order(&splats, most_visible(&splats, usize::MAX));
         let seen = Seen { pixels: (0..700).map(|i| (i % 2) as f32).collect() };
-        let packed = pack(&splats, &seen, &Splats::default(), Some(&field), usize::MAX).unwrap();
+        let none = Splats::default();
+        let layers = Layers { splats: &splats, seen: &seen, holes: &none, backdrop: &none };
+        let packed = pack(layers, Some(&field), usize::MAX).unwrap();
         let n = order.len();
-        assert_eq!((packed.shown, packed.total), (n, 700));
+        assert_eq!((&packed.order, packed.total), (&order, 700));
         let raw = unpacked(&packed);
         let mut r = Reader(&raw);
         assert_eq!(&r.take::<8>(), MAGIC);
@@ -402,8 +429,29 @@ mod tests {
         }
         assert!(r.0.is_empty());
         let unknown =
-            unpacked(&pack(&splats, &Seen::default(), &Splats::default(), Some(&field), usize::MAX).unwrap());
+            unpacked(&pack(Layers { seen: &Seen::default(), ..layers }, Some(&field), usize::MAX).unwrap());
         assert_eq!((unknown[20], unknown.len()), (0, raw.len() - n), "no row where nothing is known");
+    }
+
+    #[test]
+    fn layers_are_kinds() {
+        let (splats, _) = seeded::small(60, 40, 30, 1, 5);
+        let (holes, backdrop) = (splats.picked(&[0, 1, 2]).bare(), splats.picked(&[3, 4]).bare());
+        let seen = Seen { pixels: vec![0.0; 30] };
+        let layers = Layers { splats: &splats, seen: &seen, holes: &holes, backdrop: &backdrop };
+        let packed = pack(layers, None, usize::MAX).unwrap();
+        let raw = unpacked(&packed);
+        let kinds = &raw[raw.len() - packed.order.len()..];
+        for (kind, i) in kinds.iter().zip(&packed.order) {
+            let expected = match i {
+                0..30 => UNSEEN,
+                30..60 => 0,
+                60..63 => HOLE,
+                _ => BACKDROP | UNSEEN,
+            };
+            assert_eq!(*kind, expected, "{i}");
+        }
+        assert_eq!((packed.total, kinds.iter().filter(|kind| **kind == HOLE).count()), (65, 3));
     }
 
     #[test]

@@ -1,5 +1,6 @@
 // Depth and codes at one pixel, by blending its splats on the CPU exactly as on the screen.
 import { rotate } from "splatvk/camera";
+import { MARKS } from "splatvk/splats";
 
 const DILATION = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.99, VOID_ALPHA = 0.5;
 
@@ -8,13 +9,14 @@ const DILATION = 0.3, ALPHA_MIN = 1 / 255, ALPHA_MAX = 0.99, VOID_ALPHA = 0.5;
 export function pick(splats, camera, x, y, width, height, near, guessed) {
   const [fx, fy, cx, cy] = camera.intrinsics(width, height);
   const r = camera.rotation, t = camera.translation;
-  const { positions, logScales, quats, opacity, antialiased } = splats;
+  const { positions, logScales, quats, opacity, marks, antialiased } = splats;
+  const left = MARKS.hole | MARKS.hidden | (guessed ? 0 : MARKS.unseen);
   const hits = [];
   // As in the projection, the Jacobian is evaluated at most 15 % of the image beyond its border.
   const limits = [[-(cx + 0.15 * width) / fx, (1.15 * width - cx) / fx], [-(cy + 0.15 * height) / fy, (1.15 * height - cy) / fy]];
   const limit = (slope, [low, high]) => Math.min(Math.max(slope, low), high);
   for (let i = 0; i < splats.count; i++) {
-    if (!guessed && splats.unseen?.[i]) continue;
+    if (marks[i] & left) continue;
     const p = [positions[3 * i], positions[3 * i + 1], positions[3 * i + 2]];
     const z = r[6] * p[0] + r[7] * p[1] + r[8] * p[2] + t[2];
     if (!(z > near)) continue;

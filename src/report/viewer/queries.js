@@ -63,6 +63,15 @@ export function setQuery(answer) {
   find(".v-chips").querySelectorAll("button").forEach((b) => b.setAttribute("aria-pressed", String(b.textContent === answer?.text)));
 }
 
+/// Forgets the answers of the server: the scene has changed.
+export function forget() {
+  answers.length = 0;
+  setQuery(null);
+  if (state.mode === "relevancy") show("colour");
+  find(".v-card").hidden = true;
+  listQueries();
+}
+
 export function listQueries() {
   const asked = (text) => answers.some((a) => a.text.toLowerCase() === text.toLowerCase());
   const open = manifest.suggested.filter((text) => !asked(text)).map((text) => button(text, () => ask(text), { "aria-pressed": "false" }));

@@ -2,7 +2,7 @@
 // (glsl/shared/splat.glsl, glsl/raster_forward.comp). Three passes: the projection of every splat
 // in sorted order into a texture, the quads blended far to near into a half-float image, and the
 // map of that image to colours.
-import { half } from "splatvk/splats";
+import { MARKS, half } from "splatvk/splats";
 
 export const MODES = { colour: 0, depth: 1, level: 2, relevancy: 3, unseen: 4 };
 
@@ -14,6 +14,9 @@ const BATCH = 128;
 /// promises.
 const ROW = 2048;
 
+/// Width of the stripes of holes, pixels of the picture, and their brightness: src/run/view.rs.
+const STRIPE = 6, HATCHING = [0.35, 0.65];
+
 /// Alpha where splats of a lean picture end: half as many pixels as to the last step of a byte.
 const FAINT = 0.05;
 
@@ -23,9 +26,10 @@ void main() { gl_Position = vec4(vec2((gl_VertexID & 1) * 4 - 1, (gl_VertexID & 
 // Once per splat, not once per corner.
 const PROJECT = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
-uniform usampler2D data;     // two texels per splat: position, (r, g); (b, opacity), (log scales and unseen), quaternion
+uniform usampler2D data;     // two texels per splat: position, (r, g); (b, opacity), log scales, quaternion
 uniform usampler2D order;    // splats, far to near
 uniform usampler2D codes;    // code + 1 per level
+uniform usampler2D marks;    // MARKS
 uniform sampler2D sh;        // (degree + 1)² − 1 texels per splat, -1..1 of shScale
 uniform sampler2D table;     // per level two rows: (label colour, selected), (relevancy, answers)
 uniform vec3 shScale;
@@ -75,10 +79,13 @@ void main() {
   uvec4 a = texelFetch(data, texel(width, 2 * splat), 0), b = texelFetch(data, texel(width, 2 * splat + 1), 0);
   vec3 mean = uintBitsToFloat(a.xyz);
   vec3 t = rotation * mean + translation;
-  vec2 rg = unpackHalf2x16(a.w), bo = unpackHalf2x16(b.x), s01 = unpackHalf2x16(b.y), s2u = unpackHalf2x16(b.z);
-  float opacity = s2u.y > 0.5 ? bo.y * guessed : bo.y;
+  vec2 rg = unpackHalf2x16(a.w), bo = unpackHalf2x16(b.x), s01 = unpackHalf2x16(b.y), s2 = unpackHalf2x16(b.z);
+  uint mark = texelFetch(marks, texel(textureSize(marks, 0).x, splat), 0).r;
+  bool unseen = (mark & ${MARKS.unseen}u) != 0u, hole = (mark & ${MARKS.hole}u) != 0u;
+  float opacity = unseen ? bo.y * guessed : bo.y;
+  if (hole && mode == ${MODES.depth}) return;
   if (t.z <= near || opacity < ALPHA_MIN) return;
-  vec3 scale = exp(vec3(s01, s2u.x) + grow);
+  vec3 scale = exp(vec3(s01, s2.x) + grow);
   // Smallest three, as in the file.
   vec3 small = (vec3(uvec3(b.w, b.w >> 10, b.w >> 20) & 1023u) / 511.5 - 1.0) * 0.7071067811865476;
   float big = sqrt(max(0.0, 1.0 - dot(small, small)));
@@ -122,12 +129,15 @@ void main() {
     float luma = dot(colour, GREY);
     int k = int(texelFetch(codes, texel(textureSize(codes, 0).x, splat), 0)[level]);
     vec4 label = texelFetch(table, ivec2(k, 2 * level), 0), answer = texelFetch(table, ivec2(k, 2 * level + 1), 0);
-    if (mode == ${MODES.unseen}) shown.rgb = s2u.y > 0.5 ? vec3(0.9, 0.1, 0.6) : vec3(0.15 + 0.7 * luma);
+    if (mode == ${MODES.unseen}) shown.rgb = unseen ? vec3(0.9, 0.1, 0.6) : vec3(0.15 + 0.7 * luma);
     else if (mode == ${MODES.relevancy}) shown.rgb = vec3(luma, answer.xy);
     else {
       shown.rgb = mode == ${MODES.level} ? label.rgb : colour;
       if (selecting == 1 && label.a < 0.5) shown.rgb = 0.3 * mix(vec3(dot(shown.rgb, GREY)), shown.rgb, 0.25);
+      if ((mark & ${MARKS.selected}u) != 0u) shown.rgb = mix(shown.rgb, vec3(1.0, 0.6, 0.05), 0.6);
     }
+    // Holes are hatched by pixel.
+    if (hole) shown = vec4(0.0, 0.0, 0.0, -opacity);
   }
   place = floatBitsToUint(vec4(pixel, along));
   extent = uvec4(floatBitsToUint(vec3(deviations, reach)), 1u);
@@ -161,10 +171,17 @@ precision highp float;
 flat in vec4 value;
 in vec2 offset;
 out vec4 blended;
+uniform int mode;
+uniform float stripe; // width, pixels
 void main() {
-  float alpha = min(0.99, value.a * exp(-0.5 * dot(offset, offset)));
+  float alpha = min(0.99, abs(value.a) * exp(-0.5 * dot(offset, offset)));
   if (alpha < 1.0 / 255.0) discard;
-  blended = vec4(value.rgb * alpha, alpha);
+  vec3 shown = value.rgb;
+  if (value.a < 0.0) {
+    float grey = mod(floor((gl_FragCoord.x - gl_FragCoord.y) / stripe), 2.0) < 0.5 ? ${HATCHING[0]} : ${HATCHING[1]};
+    shown = mode == ${MODES.relevancy} ? vec3(grey, 0.0, 0.0) : vec3(grey);
+  }
+  blended = vec4(shown * alpha, alpha);
 }`;
 
 // Colour maps of the report: src/report/colour.rs.
@@ -318,7 +335,7 @@ export class Renderer {
         out[8 * i + 3] = two(c[0], c[1]);
         out[8 * i + 4] = two(c[2], splats.opacity[i]);
         out[8 * i + 5] = two(s[0], s[1]);
-        out[8 * i + 6] = two(s[2], splats.unseen ? splats.unseen[i] : 0);
+        out[8 * i + 6] = two(s[2], 0);
         out[8 * i + 7] = splats.packedQuats[i];
       }
       return out;
@@ -337,6 +354,19 @@ export class Renderer {
       return out;
     }, gl.RGBA8_SNORM, gl.RGBA, gl.BYTE);
     this.textures = { data, codes, sh };
+    this.mark(splats.marks);
+  }
+
+  /// Takes the marks of all splats.
+  mark(marks) {
+    const { gl } = this;
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.deleteTexture(this.textures.marks ?? null);
+    this.textures.marks = this.filled(marks.length, (texels) => {
+      const out = new Uint8Array(texels);
+      out.set(marks);
+      return out;
+    }, gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE);
   }
 
   sendTable() {
@@ -439,6 +469,8 @@ export class Renderer {
     gl.clear(gl.COLOR_BUFFER_BIT);
     at = this.use(this.quads, this.projected);
     gl.uniform2f(at.size, width, height);
+    gl.uniform1i(at.mode, MODES[mode]);
+    gl.uniform1f(at.stripe, STRIPE * Math.max(1, width / gl.canvas.clientWidth || 1));
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this.array);

@@ -1,6 +1,10 @@
 // Reader of the packed scene (format: src/report/viewer/pack.rs).
 const BLOCK = 256;
 
+/// Marks of a splat, bits: no photo shows it, of a hole, of the backdrop; and those of the page: it
+/// is selected, or hidden.
+export const MARKS = { unseen: 1, hole: 2, backdrop: 4, selected: 8, hidden: 16 };
+
 /// Downloads the packed scene; `tell` gets the received share where the server sends the length.
 export async function download(url, tell) {
   const reply = await fetch(url);
@@ -34,8 +38,8 @@ export function half(value) {
 
 /// Middle of the splats that photos show, the median per axis, and the radius about it that holds
 /// three quarters of them: the rest is mostly background.
-export function extentOf({ count, positions, unseen }) {
-  const seen = Uint32Array.from({ length: count }, (_, i) => i).filter((i) => !unseen?.[i]);
+export function extentOf({ count, positions, marks }) {
+  const seen = Uint32Array.from({ length: count }, (_, i) => i).filter((i) => !(marks[i] & (MARKS.unseen | MARKS.hole)));
   const quantile = (share, value) => Float32Array.from(seen, value).sort()[Math.floor(share * (seen.length - 1))] ?? 0;
   const centre = [0, 1, 2].map((k) => quantile(0.5, (i) => positions[3 * i + k]));
   const radius = quantile(0.75, (i) => Math.hypot(...centre.map((v, k) => positions[3 * i + k] - v)));
@@ -54,7 +58,7 @@ export function medianDepth({ count, positions }, camera) {
 
 /// Unpacks {count, degree, positions [N, 3], logScales [N, 3], quats [N, 4], packedQuats [N] as in
 /// the file, opacity [N], colours [N, 3], shScale [3], sh: Int8Array [N, R, 3] or null, codes: [L]
-/// x Uint16Array [N], unseen: Uint8Array [N] or null, antialiased: whether opacities include the
+/// x Uint16Array [N], marks: Uint8Array [N] of [`MARKS`], antialiased: whether opacities include the
 /// 2-D Mip filter}.
 export function unpack(buffer) {
   const view = new DataView(buffer), bytes = new Uint8Array(buffer);
@@ -109,7 +113,7 @@ export function unpack(buffer) {
   }
   const codes = [];
   for (let l = 0; l < levels; l++, at += 2 * n) codes.push(new Uint16Array(buffer.slice(at, at + 2 * n)));
-  const unseen = flags & 1 ? bytes.subarray(at, at + n) : null;
+  const marks = flags & 1 ? bytes.slice(at, at + n) : new Uint8Array(n);
   const antialiased = (flags & 2) !== 0;
-  return { count: n, degree, positions, logScales, quats, packedQuats, opacity, colours, shScale, sh, codes, unseen, antialiased };
+  return { count: n, degree, positions, logScales, quats, packedQuats, opacity, colours, shScale, sh, codes, marks, antialiased };
 }

@@ -35,7 +35,7 @@ export function begin(splats) {
   const source = JSON.parse(document.querySelector("script[type=importmap]").textContent).imports["splatvk/sort"];
   worker = new Worker(source);
   worker.onmessage = ({ data }) => sorted(data);
-  worker.postMessage({ positions: splats.positions.slice() });
+  send(splats);
 }
 
 /// Draws from now on; `busy` says whether a tap waits for another.
@@ -45,10 +45,25 @@ export function start(busy) {
   requestAnimationFrame(frame);
 }
 
-/// Shows other splats of the same scene from the present camera, once they are sorted.
+/// Shows other splats of the same scene from the present camera; resolves once they are sorted and
+/// in `scene`.
 export function replace(splats) {
-  next = { splats, renderer: new Renderer(canvas, splats, levels, Boolean(manifest.mesh)), after: request };
-  worker.postMessage({ positions: splats.positions.slice() });
+  const shown = new Promise((done) => {
+    next = { splats, renderer: new Renderer(canvas, splats, levels, Boolean(manifest.mesh)), after: request, done };
+  });
+  send(splats);
+  moved();
+  return shown;
+}
+
+function send({ positions, marks }) {
+  worker.postMessage({ positions: positions.slice(), marks: marks.slice() });
+}
+
+/// Shows changed marks of the splats.
+export function remark() {
+  scene.renderer.mark(scene.splats.marks);
+  worker.postMessage({ marks: scene.splats.marks.slice() });
   moved();
 }
 
@@ -57,9 +72,10 @@ function sorted(data) {
   waiting = false;
   if (next && data.id > next.after) {
     scene.renderer.free();
-    const { splats, renderer } = next;
+    const { splats, renderer, done } = next;
     Object.assign(scene, { splats, renderer, extent: extentOf(splats) });
     next = null;
+    done();
   }
   if (!next) {
     scene.renderer.setOrder(data);

@@ -1,6 +1,7 @@
 // The first camera: level, and with the main things in the frame.
 import { Camera, add, cross, rotate, scale, sub, unit } from "splatvk/camera";
 import { find, levels, scene, views } from "splatvk/page";
+import { MARKS } from "splatvk/splats";
 
 /// Shares of the splats of a thing of its own: below are crumbs, above is the ground with all on it.
 const CRUMB = 0.002, GROUND = 0.25;
@@ -64,7 +65,7 @@ const barOf = ({ offsetHeight }) => (offsetHeight ? offsetHeight + 16 : 0);
 /// Box of the main things in a camera, and how far the photo is reduced for it: of those that its
 /// photo shows whole; where language knows none, of the splats within half of the photos, without a
 /// tenth at every side.
-function subjectOf({ count, codes, positions, unseen }, camera) {
+function subjectOf({ count, codes, positions, marks }, camera) {
   const inside = (p) => views.filter((v) => {
     const [x, y, z] = add(rotate(v.rotation, p), v.translation);
     const [u, w] = [v.fx * x / z + v.cx, v.fy * y / z + v.cy];
@@ -72,7 +73,7 @@ function subjectOf({ count, codes, positions, unseen }, camera) {
   }).length;
   const seen = [];
   for (let i = 0; i < count; i++) {
-    if (!unseen?.[i] && inside(positions.subarray(3 * i, 3 * i + 3)) >= 0.5 * views.length) seen.push(i);
+    if (!(marks[i] & (MARKS.unseen | MARKS.hole)) && inside(positions.subarray(3 * i, 3 * i + 3)) >= 0.5 * views.length) seen.push(i);
   }
   const things = thingsOf(seen, codes[levels.findLastIndex((l) => l.colours.length)]);
   const edges = [0.55 * camera.ratio, 0.55];

@@ -4,12 +4,13 @@ import { cameraOf, early, late } from "splatvk/address";
 import { Camera } from "splatvk/camera";
 import { fold, makeRoom } from "splatvk/card";
 import { button, controls, fullScreen } from "splatvk/controls";
+import { connectEdit, erase, redo, toggleEdit, undo } from "splatvk/edit";
 import { tellOuter } from "splatvk/frame";
 import { Tape } from "splatvk/measure";
 import { connectMesh, nextMesh } from "splatvk/mesh";
 import { Motion } from "splatvk/motion";
 import { canvas, find, levels, manifest, root, say, scene, state, up, views } from "splatvk/page";
-import { hidePanels, takeTaps, tapTool } from "splatvk/panel";
+import { dragTool, hidePanels, takeDrags, takeTaps, tapTool } from "splatvk/panel";
 import { wholeOf } from "splatvk/pick";
 import { follow, kept } from "splatvk/preview";
 import { answers, ask, highlight, listQueries, setQuery } from "splatvk/queries";
@@ -72,9 +73,10 @@ function photoCamera(name) {
   return camera;
 }
 
-/// Loads the splats again, of the same scene.
+/// Loads the splats again, of the same scene; selection and answer stay.
 async function renew() {
-  replace(unpack(await gunzip(await download(manifest.scene, () => {}))));
+  await replace(unpack(await gunzip(await download(manifest.scene, () => {}))));
+  restore();
 }
 
 /// Marks selection and answer in a new graphics context.
@@ -119,6 +121,7 @@ function clear() {
 /// Ends the tool that takes taps.
 function giveUp() {
   takeTaps(null);
+  takeDrags(null);
   say("");
 }
 
@@ -132,7 +135,7 @@ function tap(x, y, centre) {
   const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : wholeOf(scene.splats, levels, hit.codes);
   if (level < 0) return say("Nothing that the scene has words for.");
   setQuery(null);
-  select(level, hit);
+  select(level, { ...hit, at: { camera: scene.motion.camera.stated(...size()), pixel: [x, y] } });
 }
 
 function measureAt(x, y, depth) {
@@ -168,6 +171,8 @@ const actions = {
   full: () => fullScreen(root),
   measure: () => measure(),
   views: toggleViews,
+  edit: toggleEdit,
+  erase, undo, redo,
   mesh: nextMesh,
   help: () => find(".v-help").showModal(),
 };
@@ -188,12 +193,13 @@ function connect() {
   connectBudget();
   connectQueries();
   connectMesh();
+  connectEdit({ load: renew, clear });
   connectViews({ goTo: (name) => scene.motion.goTo(namedCamera(name), -1) });
   const toView = (act) => (...given) => (root.scrollIntoView({ block: "nearest" }), act(...given));
   const selectCode = (level, code) => (setQuery(null), select(level, { codes: levels.map((_, at) => (at === level ? code : -1)) }));
   connectPage({ splats: scene.splats, levels, answers }, { ask: toView(ask), select: toView(selectCode) });
   const fills = () => document.fullscreenElement === root || root.matches(".full, .wide");
-  input = controls({ root, canvas, motion: scene.motion, actions, tap, tapsAtOnce: () => tape.active || tapTool() !== null, surface, fills, nextMode, toggleGuessed, clear: () => hidePanels() || clear() });
+  input = controls({ root, canvas, motion: scene.motion, actions, tap, tapsAtOnce: () => tape.active || tapTool() !== null, dragTool, surface, fills, nextMode, toggleGuessed, clear: () => hidePanels() || clear() });
 }
 
 /// States how many of the splats the page has, where it has not all.

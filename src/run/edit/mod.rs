@@ -5,17 +5,22 @@ pub mod expression;
 mod floaters;
 mod select;
 
+use super::Answers;
 use super::ask::QueryScene;
 use super::encoder;
 use super::plan::Machine;
 use crate::format::edits::{Edit, EditList, Operation, Rows, Term};
 use crate::format::scene_dir::{self, Scene};
+use crate::infer::RegionEncoder;
 use crate::pass::renderer::Renderer;
+use crate::query::QueryOptions;
 use crate::query::clicks::Standing;
 use crate::query::instances::Places;
+use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, Image, LanguageField};
 use crate::{Error, Result, gpu};
 use std::path::Path;
+use std::sync::Arc;
 
 /// Selected splats.
 #[derive(Clone, Debug, Default)]
@@ -48,11 +53,13 @@ pub struct Selected {
 /// ```
 pub struct Editor {
     machine: Machine,
+    /// Reason why the scene cannot be edited.
+    fixed: Option<String>,
     /// The scene as it was reconstructed.
-    whole: Scene,
+    whole: Arc<Scene>,
     list: EditList,
     /// The scene after its edits.
-    scene: Scene,
+    scene: Arc<Scene>,
     /// State of selections, made by the first one that needs it.
     lookup: Lookup,
 }
@@ -60,6 +67,8 @@ pub struct Editor {
 /// Data of the edited scene for selections.
 #[derive(Default)]
 struct Lookup {
+    /// Text model of `words`, while they are none.
+    encoder: Option<Box<dyn RegionEncoder>>,
     /// Words and codes, on the device.
     words: Option<QueryScene>,
     /// Depth of the splats, on the device.
@@ -83,8 +92,39 @@ impl Editor {
         }
         let whole = scene_dir::load_unedited(path)?;
         let list = EditList::read(path, &whole.splats)?;
-        let scene = list.apply(whole.clone());
-        Ok(Editor { machine: machine.clone(), whole, list, scene, lookup: Lookup::default() })
+        let whole = Arc::new(whole);
+        let scene = edited(&whole, &list);
+        Ok(Editor { machine: machine.clone(), fixed: None, whole, list, scene, lookup: Lookup::default() })
+    }
+
+    /// A loaded scene for selections and questions. Edits are refused with a reason.
+    pub fn read_only(scene: Scene, reason: &str, machine: &Machine) -> Editor {
+        let (list, whole) = (EditList::new(&scene.splats), Arc::new(scene));
+        Editor {
+            machine: machine.clone(),
+            fixed: Some(reason.to_owned()),
+            scene: whole.clone(),
+            whole,
+            list,
+            lookup: Lookup::default(),
+        }
+    }
+
+    /// Takes the list that is in the scene now; returns whether another program changed it.
+    ///
+    /// # Errors
+    /// A list that cannot be read; the present one stays then.
+    pub fn reload(&mut self) -> Result<bool> {
+        let list = match self.fixed {
+            Some(_) => return Ok(false),
+            None => EditList::read(&self.whole.path, &self.whole.splats)?,
+        };
+        let differs = list != self.list;
+        if differs {
+            let scene = edited(&self.whole, &list);
+            self.take(list, scene);
+        }
+        Ok(differs)
     }
 
     /// The scene after its edits.
@@ -128,7 +168,7 @@ impl Editor {
         for (operation, Selected { terms, rows, .. }) in edits {
             list.push(Edit { operation, selection: terms, splats: rows });
         }
-        let scene = list.apply(self.whole.clone());
+        let scene = edited(&self.whole, &list);
         if scene.splats.is_empty() {
             return Err(Error::input(format!(
                 "{}: the edit leaves no splat; nothing is changed",
@@ -159,14 +199,53 @@ impl Editor {
         if !step(&mut list) {
             return Ok(false);
         }
-        let scene = list.apply(self.whole.clone());
+        let scene = edited(&self.whole, &list);
         self.replace(list, scene).map(|()| true)
     }
 
-    fn replace(&mut self, list: EditList, scene: Scene) -> Result<()> {
+    fn replace(&mut self, list: EditList, scene: Arc<Scene>) -> Result<()> {
+        if let Some(reason) = &self.fixed {
+            return Err(Error::input(reason.clone()));
+        }
         list.replace(&self.list, &self.whole)?;
-        (self.list, self.scene, self.lookup) = (list, scene, Lookup::default());
+        self.take(list, scene);
         Ok(())
+    }
+
+    fn take(&mut self, list: EditList, scene: Arc<Scene>) {
+        let Lookup { encoder, words, .. } = std::mem::take(&mut self.lookup);
+        self.lookup.encoder = words.map(QueryScene::into_encoder).or(encoder);
+        (self.list, self.scene) = (list, scene);
+    }
+
+    /// Answers a text in the views of the photos.
+    ///
+    /// # Errors
+    /// A scene without language, and a text that its model does not know.
+    pub fn ask(&mut self, text: &str, options: &QueryOptions) -> Result<Answers> {
+        self.prepare()?;
+        self.words()?.ask(text, options)
+    }
+
+    /// Decodes the views of the photos, which [`Editor::ask`] otherwise does with its first text.
+    ///
+    /// # Errors
+    /// A scene without language, and a missing text model.
+    pub fn prepare(&mut self) -> Result<()> {
+        let scene = self.scene.clone();
+        let words = self.words()?;
+        if words.frames().is_empty() {
+            words.set_views(&scene.cameras)?;
+        }
+        Ok(())
+    }
+
+    /// The best phrases of the text model for each code.
+    ///
+    /// # Errors
+    /// A scene without language, and a missing text model.
+    pub fn names(&mut self) -> Result<CodeNames> {
+        self.words()?.names()
     }
 
     /// The scene with its words on the device.
@@ -179,7 +258,10 @@ impl Editor {
                     scene.path.display()
                 ))
             })?;
-            let encoder = encoder::of_scene(scene, self.machine.registry()?)?;
+            let encoder = match self.lookup.encoder.take() {
+                Some(encoder) => encoder,
+                None => encoder::of_scene(scene, self.machine.registry()?)?,
+            };
             let device = gpu::open(self.machine.device.as_deref())?;
             let ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
             self.lookup.words = Some(ready);
@@ -206,6 +288,14 @@ impl Editor {
                 Places::of(&scene.splats, scene.language.as_ref().unwrap_or(&LanguageField::default()))
             }),
         }
+    }
+}
+
+/// The scene after the edits of a list; without any it is shared.
+fn edited(whole: &Arc<Scene>, list: &EditList) -> Arc<Scene> {
+    match list.edits.is_empty() {
+        true => whole.clone(),
+        false => Arc::new(list.apply(Scene::clone(whole))),
     }
 }
 

@@ -3,13 +3,15 @@ use super::complete::completed;
 use super::{Editor, floaters};
 use crate::format::edits::{Combine, Pick, Property, Term};
 use crate::query::clicks::Standing;
+use crate::query::instances::Instance;
 use crate::query::presence::Presence;
 use crate::query::{MaskRule, QueryOptions};
 use crate::run::Compat;
 use crate::scene::{Camera, LEVEL_NAMES, LanguageField};
 use crate::{Error, Result};
-use glam::DVec2;
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
+use std::collections::HashSet;
 
 /// Splats of a rule.
 #[derive(Default)]
@@ -150,7 +152,7 @@ impl Editor {
         Error::input(format!("{}: {reason}", self.scene.path.display()))
     }
 
-    /// Splats of the code at a pixel.
+    /// Splats of the thing at a pixel: of several things with one code, the nearest.
     fn click(
         &mut self,
         camera: &Camera,
@@ -171,7 +173,20 @@ impl Editor {
             let [x, y] = pixel;
             Error::input(format!("{}: there is no thing at pixel {x:.0}, {y:.0}", camera.name))
         })?;
-        Ok((self.places().lists()[level].splats_of(std::iter::once(code)), level))
+        let depth = f64::from(self.depth(camera)?.data[at]);
+        let place = camera.unproject(DVec2::from_array(pixel), depth);
+        let splats = self.places().lists()[level].splats_of(std::iter::once(code));
+        let groups = self.places().instances(&splats, level);
+        let means = &self.scene.splats.means;
+        let distance = |group: &Instance| {
+            let squares = group.splats.iter().map(|i| DVec3::from(means[*i].map(f64::from)));
+            squares.map(|mean| mean.distance_squared(place)).fold(f64::INFINITY, f64::min)
+        };
+        let nearest = (0..groups.len()).min_by(|a, b| distance(&groups[*a]).total_cmp(&distance(&groups[*b])));
+        // Specks of the code that are no thing of their own go with the clicked one, as with a word.
+        let others = groups.iter().enumerate().filter(|(k, _)| Some(*k) != nearest);
+        let others: HashSet<usize> = others.flat_map(|(_, group)| group.splats.iter().copied()).collect();
+        Ok((splats.into_iter().filter(|i| !others.contains(i)).collect(), level))
     }
 
     /// Splats whose centres lie in an outline.
@@ -189,7 +204,7 @@ impl Editor {
         };
         let means = &self.scene.splats.means;
         let inside = |i: &usize| {
-            let (pixel, z) = camera.project(glam::DVec3::from_array(means[*i].map(f64::from)));
+            let (pixel, z) = camera.project(DVec3::from_array(means[*i].map(f64::from)));
             z > 0.0 && is_inside(polygon, pixel)
         };
         Ok(shown.into_par_iter().filter(inside).collect())
