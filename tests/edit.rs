@@ -7,10 +7,11 @@ use fixture::view::{breakfast, masks_of};
 use serde_json::Value;
 use splatvk::format::edits::{Combine, EditList, Operation, Pick, Term};
 use splatvk::format::gaussians;
-use splatvk::format::scene_dir::{self, Scene};
+use splatvk::format::scene_dir::{self, Contents, Scene};
 use splatvk::photo;
 use splatvk::run::Machine;
 use splatvk::run::edit::Editor;
+use splatvk::scene::{Camera, Pose, Seen, Splats, World};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
@@ -106,13 +107,71 @@ fn word_thing_and_click_delete_the_same() {
     let visible = editor.select(&both).unwrap();
     assert!(visible.count > word.count / 4 && visible.count < word.count, "{}", visible.count);
 
-    editor.push(vec![(Operation::Delete {}, click)]).unwrap();
+    let along = editor.push(vec![(Operation::Delete {}, click)]).unwrap();
     let (after, edits) = state(&path);
-    assert_eq!((after.splats.len(), edits), (whole.splats.len() - splats_of(MUG), Some(1)));
-    assert_eq!(after.holes.len(), splats_of(MUG));
+    let taken = splats_of(MUG) + along;
+    assert_eq!((after.splats.len(), edits), (whole.splats.len() - taken, Some(1)));
+    assert_eq!(after.holes.len(), taken);
+    assert!(along < splats_of(MUG) / 10, "{along}");
     // Nothing of it is left to select.
     let gone = editor.select(&terms(Pick::Thing { id: "l9".into() })).unwrap_err();
     assert!(gone.exit_code() == 2 && gone.to_string().contains("id:l9"), "{gone}");
+}
+
+/// A wall of large splats in front of small ones, which stand beside it, too.
+#[test]
+fn deletion_takes_along_what_no_photo_shows() {
+    let folder = tempfile::tempdir().unwrap();
+    let grid = |step: f32, half: i32| {
+        (-half..=half).flat_map(move |x| (-half..=half).map(move |y| [step * x as f32, step * y as f32]))
+    };
+    let wall: Vec<[f32; 3]> = grid(0.05, 6).map(|[x, y]| [x, y, 2.0]).collect();
+    let floor: Vec<[f32; 3]> = grid(0.05, 20).map(|[x, y]| [x, y, 4.0]).collect();
+    let count = wall.len() + floor.len();
+    let size = |i: usize| if i < wall.len() { 0.05f32 } else { 0.03 };
+    let splats = Splats {
+        log_scales: (0..count).map(|i| [size(i).ln(); 3]).collect(),
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; count],
+        opacity_logits: vec![4.0; count],
+        sh: vec![0.0; 3 * count],
+        means: [wall.clone(), floor.clone()].concat(),
+        ..Splats::default()
+    };
+    let camera = Camera {
+        name: "front".into(),
+        width: 160,
+        height: 160,
+        fx: 200.0,
+        fy: 200.0,
+        cx: 80.0,
+        cy: 80.0,
+        pose: Pose::IDENTITY,
+    };
+    let path = folder.path().join("wall");
+    std::fs::create_dir(&path).unwrap();
+    let contents = Contents {
+        splats: &splats,
+        seen: &Seen::default(),
+        backdrop: &Splats::default(),
+        holes: &Splats::default(),
+        cameras: &[camera],
+        world: &World::default(),
+        photos: &[],
+        points: None,
+        language: None,
+        text_embeddings: None,
+    };
+    scene_dir::write(&path, &contents).unwrap();
+    let told = runs(&mut edit(&path, &["--delete", "size>0.04"]));
+    assert!(told.contains(&format!("{} splats", wall.len())), "{told}");
+    let (left, _) = state(&path);
+    // The wall covers ±0.3 at depth 2, hence ±0.6 at depth 4; its outermost splats end softly.
+    let reach = |mean: &[f32; 3]| mean[0].abs().max(mean[1].abs());
+    assert!(left.splats.means.iter().all(|mean| mean[2] == 4.0 && reach(mean) > 0.5), "{told}");
+    let beside = floor.iter().filter(|mean| reach(mean) > 0.8).count();
+    assert!(left.splats.len() >= beside && beside > 0, "{} {beside}", left.splats.len());
+    runs(&mut edit(&path, &["--undo"]));
+    assert_eq!(state(&path).0.splats, splats);
 }
 
 #[test]
@@ -124,7 +183,7 @@ fn every_command_sees_the_edits_until_they_are_undone() {
         &path,
         &["--delete", "blue mug", "--recolour", "lemon=#36f", "--move", "plate=0,0,0.1", "--force"],
     ));
-    assert_eq!(told.lines().count(), 3, "{told}");
+    assert!(told.lines().count() == 4 && told.contains("no photo shows them"), "{told}");
     let (edited, edits) = state(&path);
     assert_eq!(edits, Some(3));
     assert_eq!(scene_dir::load_unedited(&path).unwrap().splats, whole.splats);

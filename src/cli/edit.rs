@@ -93,9 +93,10 @@ pub fn edit(args: &EditArgs) -> Result<()> {
     }
     let lines: Vec<String> = made.iter().map(|(operation, selected)| line(operation, selected)).collect();
     let records: Vec<Value> = made.iter().map(|(operation, selected)| record(operation, selected)).collect();
-    if !args.dry_run && !made.is_empty() {
-        editor.push(made)?;
-    }
+    let along = match args.dry_run || made.is_empty() {
+        true => 0,
+        false => editor.push(made)?,
+    };
     if let Some(out) = &args.bake {
         let device = gpu::open(args.device.device.as_deref())?;
         let mut baked = LiveScene::loaded(&device, editor.scene().clone(), &args.device.registry()?)?;
@@ -104,11 +105,14 @@ pub fn edit(args: &EditArgs) -> Result<()> {
     if args.device.json {
         let list = editor.list();
         return print_json(&json!({
-            "scene": args.scene, "dry_run": args.dry_run, "made": records, "undone_now": steps,
+            "scene": args.scene, "dry_run": args.dry_run, "made": records, "along": along, "undone_now": steps,
             "edits": entries(&list.edits), "undone": entries(&list.undone), "baked": args.bake,
         }));
     }
     let mut text = lines.concat();
+    if along > 0 {
+        let _ = writeln!(text, "{along} splats behind the deleted ones went along: no photo shows them");
+    }
     if let Some(steps) = steps {
         let verb = if args.undo.is_some() { "undone" } else { "redone" };
         let _ = writeln!(text, "{steps} {verb}");

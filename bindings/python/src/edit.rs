@@ -129,7 +129,7 @@ impl Editor {
         let selected = self.selected(py, selection, grow)?;
         Ok(Selection { selected, splats: self.editor().list().splats() })
     }
-    /// Removes splats; returns their number.
+    /// Removes splats; returns the number of selected ones.
     #[pyo3(signature = (selection, force = false))]
     fn delete(&self, py: Python<'_>, selection: &Bound<'_, PyAny>, force: bool) -> PyResult<usize> {
         self.push(py, Operation::Delete {}, selection, force)
@@ -173,7 +173,7 @@ impl Editor {
         self.work(py, |editor| {
             let selected = editor.select(&terms)?;
             let count = selected.count;
-            editor.push(vec![(Operation::Delete {}, selected)]).map(|()| count)
+            editor.push(vec![(Operation::Delete {}, selected)]).map(|_| count)
         })
     }
     /// Undoes the last edit; False without one.

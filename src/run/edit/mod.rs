@@ -9,10 +9,12 @@ use super::Answers;
 use super::ask::QueryScene;
 use super::encoder;
 use super::plan::Machine;
+use super::view;
 use crate::format::edits::{Edit, EditList, Operation, Rows, Term};
 use crate::format::scene_dir::{self, Scene};
 use crate::infer::RegionEncoder;
 use crate::pass::renderer::Renderer;
+use crate::progress::Silent;
 use crate::query::QueryOptions;
 use crate::query::clicks::Standing;
 use crate::query::instances::Places;
@@ -21,6 +23,10 @@ use crate::scene::{Camera, Image, LanguageField};
 use crate::{Error, Result, gpu};
 use std::path::Path;
 use std::sync::Arc;
+
+/// Part of its blending weight without the splats in front of it up to which a splat is hidden. On
+/// breakfast a deleted mug leaves blobs with 0.1 and none with 0.2.
+const HIDDEN: f32 = 0.2;
 
 /// Selected splats.
 #[derive(Clone, Debug, Default)]
@@ -158,14 +164,22 @@ impl Editor {
         Ok(Selected { rows, count, share, doubts, terms: terms.to_vec() })
     }
 
-    /// Adds edits of selections, and writes the list into the scene.
+    /// Adds edits of selections, and writes the list into the scene. A deletion takes along splats
+    /// that it would uncover and no photo shows; returns their number.
     ///
     /// # Errors
     /// Edits that leave nothing, a folder that cannot be written, and a list that another program
     /// changed meanwhile; the scene is unchanged then.
-    pub fn push(&mut self, edits: Vec<(Operation, Selected)>) -> Result<()> {
-        let mut list = self.list.clone();
-        for (operation, Selected { terms, rows, .. }) in edits {
+    pub fn push(&mut self, edits: Vec<(Operation, Selected)>) -> Result<usize> {
+        let (mut list, mut deleted, mut along) = (self.list.clone(), Rows::default(), 0);
+        for (operation, Selected { terms, mut rows, .. }) in edits {
+            if operation == (Operation::Delete {}) {
+                deleted = deleted.with(&rows);
+                let uncovered = self.uncovered(&deleted)?;
+                along += uncovered.count();
+                rows = rows.with(&uncovered);
+                deleted = deleted.with(&uncovered);
+            }
             list.push(Edit { operation, selection: terms, splats: rows });
         }
         let scene = edited(&self.whole, &list);
@@ -175,7 +189,7 @@ impl Editor {
                 self.whole.path.display()
             )));
         }
-        self.replace(list, scene)
+        self.replace(list, scene).map(|()| along)
     }
 
     /// Undoes the last edit; false without one.
@@ -267,6 +281,19 @@ impl Editor {
             self.lookup.words = Some(ready);
         }
         self.lookup.words.as_mut().ok_or_else(|| Error::work("no words"))
+    }
+
+    /// Splats that are hidden in all photos until others are deleted: photos never formed them.
+    fn uncovered(&self, deleted: &Rows) -> Result<Rows> {
+        let scene = &self.scene;
+        let row = |i: usize| scene.edits.as_ref().map_or(i, |edits| edits.rows[i] as usize);
+        let kept: Vec<usize> = (0..scene.splats.len()).filter(|i| !deleted.has(row(*i))).collect();
+        let device = gpu::open(self.machine.device.as_deref())?;
+        let bare = scene.splats.bare();
+        let before = view::seen(&device, &bare, &scene.cameras, &Silent)?.pixels;
+        let after = view::seen(&device, &bare.picked(&kept), &scene.cameras, &Silent)?.pixels;
+        let is_hidden = |(i, after): &(&usize, &f32)| before[**i] < HIDDEN * **after;
+        Ok(Rows::of(kept.iter().zip(&after).filter(is_hidden).map(|(i, _)| row(*i))))
     }
 
     /// Depth of a view, scene units; 0 where nothing is.

@@ -200,6 +200,14 @@ impl Rows {
         Rows(bits)
     }
 
+    /// The set with another one.
+    pub fn with(&self, other: &Rows) -> Rows {
+        let (long, short) = if self.0.len() >= other.0.len() { (self, other) } else { (other, self) };
+        let mut bits = long.0.clone();
+        bits.iter_mut().zip(&short.0).for_each(|(byte, more)| *byte |= more);
+        Rows(bits)
+    }
+
     /// Whether a splat is in the set.
     pub fn has(&self, row: usize) -> bool {
         self.0.get(row / 8).is_some_and(|byte| byte >> (row % 8) & 1 == 1)
