@@ -13,26 +13,6 @@ use splatvk::format::views::Views;
 use std::path::Path;
 use std::process::Command;
 
-/// Fills a field of the panel and presses Enter.
-fn enter(page: &mut Page, label: &str, text: &str) {
-    page.run(&format!("document.querySelector('[aria-label=\"{label}\"]').focus()"));
-    page.write(text);
-    page.press("Enter");
-}
-
-/// Waits until an expression is true.
-fn wait_for(page: &mut Page, expression: &str) {
-    let look = format!(
-        "new Promise((done, fail) => {{ const end = performance.now() + 30000; \
-         const look = () => ({expression}) ? done(true) : performance.now() > end ? fail(Error('never')) : setTimeout(look, 20); look(); }})"
-    );
-    assert_eq!(page.run(&look), true, "{expression}");
-}
-
-fn click_on(page: &mut Page, selector: &str) {
-    page.run(&format!("document.querySelector('{selector}').click()"));
-}
-
 fn position(page: &mut Page) -> Vec<f64> {
     let eye = page.run("splatvk.camera().position");
     eye.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
@@ -47,26 +27,26 @@ fn views_and_notes_are_saved_and_shown() {
     let mut page = Page::open(&chromium, 720, 540, false);
     page.go(&server.address);
     page.run("splatvk.goTo(0)");
-    click_on(&mut page, "[data-do=views]");
-    enter(&mut page, "Name of this view", "Left");
-    wait_for(&mut page, "document.querySelectorAll('#v-views li').length === 1");
+    page.click_on("[data-do=views]");
+    page.enter("Name of this view", "Left");
+    page.wait_for("document.querySelectorAll('#v-views li').length === 1");
     let left = position(&mut page);
     page.run("splatvk.goTo(1)");
-    enter(&mut page, "Name of this view", "Right");
-    wait_for(&mut page, "document.querySelectorAll('#v-views li').length === 2");
+    page.enter("Name of this view", "Right");
+    page.wait_for("document.querySelectorAll('#v-views li').length === 2");
     let right = position(&mut page);
     // A name that exists already is refused, in any case of its letters.
-    enter(&mut page, "Name of this view", "left");
-    wait_for(&mut page, "document.querySelector('.v-status').textContent.includes('already')");
-    click_on(&mut page, "[aria-label=\"Start with Right\"]");
-    wait_for(&mut page, "document.querySelector('[aria-label=\"Start with Right\"]').ariaPressed === 'true'");
-    enter(&mut page, "Text of a note", "here it is");
+    page.enter("Name of this view", "left");
+    page.wait_for("document.querySelector('.v-status').textContent.includes('already')");
+    page.click_on("[aria-label=\"Start with Right\"]");
+    page.wait_for("document.querySelector('[aria-label=\"Start with Right\"]').ariaPressed === 'true'");
+    page.enter("Text of a note", "here it is");
     page.click(500.0, 300.0);
-    wait_for(&mut page, "document.querySelectorAll('.v-pin').length === 1");
-    click_on(&mut page, "[aria-label=\"Rename Left\"]");
+    page.wait_for("document.querySelectorAll('.v-pin').length === 1");
+    page.click_on("[aria-label=\"Rename Left\"]");
     page.run("document.querySelector('[aria-label=\"New name\"]').value = ''");
-    enter(&mut page, "New name", "From the left");
-    wait_for(&mut page, "document.querySelector('[aria-label=\"Rename From the left\"]')");
+    page.enter("New name", "From the left");
+    page.wait_for("document.querySelector('[aria-label=\"Rename From the left\"]')");
     keep_screenshot(&mut page, "views.png");
     assert_eq!(page.complaints, Vec::<String>::new());
 
@@ -90,7 +70,7 @@ fn views_and_notes_are_saved_and_shown() {
     assert!(close(&position(&mut page), &right), "the view at the start");
     page.go(&format!("{}?view=from%20the%20left&ui=0&query=lemon", server.address));
     assert!(close(&position(&mut page), &left), "the view of the address");
-    wait_for(&mut page, "splatvk.state.query?.text === 'lemon' && splatvk.state.mode === 'relevancy'");
+    page.wait_for("splatvk.state.query?.text === 'lemon' && splatvk.state.mode === 'relevancy'");
     assert_eq!(page.run("getComputedStyle(document.querySelector('.v-bottom')).display"), "none");
     keep_screenshot(&mut page, "bare.png");
     page.go(&format!("{}?view=2&show=depth", server.address));
@@ -122,7 +102,7 @@ fn check_offline(chromium: &str, scene: &Path, start: &[f64]) {
         said.as_str().unwrap().contains("unicorn") && said.as_str().unwrap().contains("splatvk view"),
         "{said}"
     );
-    click_on(&mut page, "[data-do=views]");
+    page.click_on("[data-do=views]");
     assert_eq!(page.run("document.querySelectorAll('#v-views li').length"), 3);
     assert_eq!(
         page.run("document.querySelectorAll('#v-views form, #v-views [aria-label^=Delete]').length"),
@@ -185,16 +165,22 @@ fn every_state_is_accessible() {
             assert_eq!(page.run(OUTSIDE), json!([]), "{state}, {width} x {height}");
         };
         check(&mut page, "start");
-        click_on(&mut page, "[data-do=views]");
+        page.click_on("[data-do=views]");
         check(&mut page, "views");
         page.press("Escape");
         page.run("document.querySelector('#v-views .v-close').click(), splatvk.ask('lemon')");
         check(&mut page, "answer");
         keep_screenshot(&mut page, &format!("access-{width}.png"));
-        page.run("document.querySelector('.v-card .v-close').click()");
-        click_on(&mut page, "[data-do=help]");
+        page.click_on(".v-edit");
+        page.wait_for("document.querySelector('#v-edit').textContent.includes('splats, ')");
+        page.run("(() => { const s = document.querySelector('#v-edit select'); s.value = 'size'; s.onchange({ target: s }); })()");
+        page.wait_for("document.querySelector('.v-bars')");
+        check(&mut page, "edit");
+        keep_screenshot(&mut page, &format!("edit-{width}.png"));
+        page.click_on("#v-edit .v-close");
+        page.click_on("[data-do=help]");
         check(&mut page, "keys");
-        click_on(&mut page, ".v-help .v-close");
+        page.click_on(".v-help .v-close");
         check_focus_order(&mut page);
     }
 }

@@ -112,6 +112,11 @@ impl LiveSite {
         content.numbers.1 += 1;
     }
 
+    /// Number of the present scene of the page.
+    pub fn scene(&self) -> u64 {
+        lock(&self.0.content).numbers.1
+    }
+
     /// A line for the open page.
     pub fn say(&self, notice: &str) {
         lock(&self.0.content).notice = notice.to_owned();

@@ -296,12 +296,7 @@ static NO_SPLATS: LazyLock<Splats> = LazyLock::new(Splats::default);
 fn scene<'a>(title: &'a str, photos: &'a [RgbImage], o: &'a RunOutcome) -> Scene3d<'a> {
     Scene3d {
         title,
-        layers: Layers {
-            splats: &o.splats,
-            seen: &o.seen,
-            holes: &NO_SPLATS,
-            backdrop: &o.backdrop,
-        },
+        layers: Layers { splats: &o.splats, seen: &o.seen, holes: &NO_SPLATS, backdrop: &o.backdrop },
         cameras: &o.cameras,
         world: &o.world,
         photos: photos.iter().collect(),

@@ -182,6 +182,39 @@ impl Page {
         self.call("Input.dispatchKeyEvent", json!({ "type": "keyUp", "key": key }));
     }
 
+    /// Clicks on the first element of a selector.
+    pub fn click_on(&mut self, selector: &str) {
+        self.run(&format!("document.querySelector({}).click()", json!(selector)));
+    }
+
+    /// Waits until an expression is true.
+    pub fn wait_for(&mut self, expression: &str) {
+        let look = format!(
+            "new Promise((done, fail) => {{ const end = performance.now() + 30000; \
+             const look = () => ({expression}) ? done(true) : performance.now() > end ? fail(Error('never')) : setTimeout(look, 20); look(); }})"
+        );
+        assert_eq!(self.run(&look), true, "{expression}");
+    }
+
+    /// Fills the field of a name and presses Enter.
+    pub fn enter(&mut self, label: &str, text: &str) {
+        self.run(&format!("document.querySelector('[aria-label=\"{label}\"]').focus()"));
+        self.write(text);
+        self.press("Enter");
+    }
+
+    /// Draws with the left button along positions of the page.
+    pub fn draw(&mut self, path: &[[f64; 2]]) {
+        let mut send = |kind: &str, [x, y]: [f64; 2]| {
+            let button =
+                json!({ "type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1 });
+            self.call("Input.dispatchMouseEvent", button);
+        };
+        send("mousePressed", path[0]);
+        path.iter().for_each(|at| send("mouseMoved", *at));
+        send("mouseReleased", path[path.len() - 1]);
+    }
+
     /// Types a text into the focused element.
     pub fn write(&mut self, text: &str) {
         self.call("Input.insertText", json!({ "text": text }));

@@ -1,7 +1,7 @@
 //! Requests of a page that need its scene: questions, selections and edits.
 use crate::cli::edit::entry;
 use crate::cli::serve::{Answer, Asks, LiveSite};
-use crate::format::edits::{Combine, Operation, Pick, Rows, Term};
+use crate::format::edits::{Combine, Operation, Pick, Property, Rows, Term};
 use crate::query::QueryOptions;
 use crate::report::viewer::{self, Packed};
 use crate::run::edit::expression::{self, terms};
@@ -19,6 +19,15 @@ pub struct Backend {
     budget: usize,
     /// Index of every splat of the page in the scene ([`Packed::order`]).
     order: Vec<usize>,
+}
+
+/// Body of a request of the page.
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Body {
+    /// Number of the page's scene ([`LiveSite::scene`]): bitmaps fit no other.
+    scene: Option<u64>,
+    request: Request,
 }
 
 /// Request of the page.
@@ -39,6 +48,8 @@ enum Request {
     Redo {},
     /// Lists the edits.
     List {},
+    /// Distribution of a property.
+    Histogram(Property),
 }
 
 /// Part of a selection: an expression, or a rule.
@@ -61,12 +72,23 @@ impl Backend {
 
     /// Answers a request; an edit gives the site other splats.
     pub fn answer(&mut self, asks: &Asks, live: &LiveSite) -> Answer {
+        let refused = |e: Error| (if (2..=3).contains(&e.exit_code()) { 422 } else { 500 }, e.to_string());
         let answer = match asks {
             Asks::Text(text) => self.query(text),
-            Asks::Edit(body) => self.edit(body, live),
+            Asks::Edit(body) => {
+                let Body { scene, request } = serde_json::from_slice(body)
+                    .map_err(|e| refused(Error::input(format!("this is no edit: {e}"))))?;
+                if self.editor.reload().map_err(refused)? {
+                    self.renew(live).map_err(refused)?;
+                }
+                if scene.is_some_and(|scene| scene != live.scene()) {
+                    let notice = "The scene was edited elsewhere meanwhile; this is how it is now.";
+                    return Err((409, notice.to_owned()));
+                }
+                self.edit(request, live)
+            }
         };
-        let status = |e: &Error| if (2..=3).contains(&e.exit_code()) { 422 } else { 500 };
-        answer.map(|value| value.to_string()).map_err(|e| (status(&e), e.to_string()))
+        answer.map(|value| value.to_string()).map_err(refused)
     }
 
     fn query(&mut self, text: &str) -> Result<Value> {
@@ -77,17 +99,13 @@ impl Backend {
         Ok(reply)
     }
 
-    fn edit(&mut self, body: &[u8], live: &LiveSite) -> Result<Value> {
-        let request: Request =
-            serde_json::from_slice(body).map_err(|e| Error::input(format!("this is no edit: {e}")))?;
-        if self.editor.reload()? {
-            self.renew(live)?;
-            if !matches!(request, Request::List {}) {
-                return Err(Error::input("another program edited the scene: it is shown now; try again"));
-            }
-        }
+    fn edit(&mut self, request: Request, live: &LiveSite) -> Result<Value> {
         let changes = match request {
             Request::Select(parts) => return self.select(&parts),
+            Request::Histogram(property) => {
+                let histogram = self.editor.histogram(property)?;
+                return Ok(json!({ "edges": histogram.edges, "counts": histogram.counts }));
+            }
             Request::List {} => false,
             Request::Undo {} => self.editor.undo()?,
             Request::Redo {} => self.editor.redo()?,

@@ -122,7 +122,7 @@ function keys(view, zoomAt) {
   const table = {
     "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
     r: actions.reset, home: actions.reset, 0: actions.all, m: () => view.nextMode(1), g: view.toggleGuessed,
-    l: actions.measure, p: actions.save, v: actions.views, x: actions.edit, delete: actions.erase, backspace: actions.erase, t: actions.mesh, f: actions.full, "?": actions.help, h: actions.help,
+    l: actions.measure, p: actions.save, v: actions.views, x: () => actions.edit?.(), delete: () => actions.erase?.(), backspace: () => actions.erase?.(), t: actions.mesh, f: actions.full, "?": actions.help, h: actions.help,
     "/": () => root.querySelector(".v-ask input").focus(), escape: view.clear,
   };
   root.addEventListener("keydown", (e) => {
@@ -134,7 +134,7 @@ function keys(view, zoomAt) {
     const key = e.key.toLowerCase();
     if ((e.ctrlKey || e.metaKey) && key === "z") {
       e.preventDefault();
-      return e.shiftKey ? actions.redo() : actions.undo();
+      return e.shiftKey ? actions.redo?.() : actions.undo?.();
     }
     if (e.ctrlKey || e.metaKey || e.altKey) return;
     if (arrows[e.key]) {

@@ -2,6 +2,7 @@
 // server selects and keeps the edits in the scene (POST edit); the page keeps the selection, the
 // hidden splats and the order of the steps.
 import { button } from "splatvk/controls";
+import { lengthText } from "splatvk/measure";
 import { outliner } from "splatvk/outline";
 import { canvas, find, levels, manifest, say, scene, state } from "splatvk/page";
 import { addPanel, takeDrags, takeTaps } from "splatvk/panel";
@@ -26,13 +27,22 @@ let how = "new", tool = "click", through = false, last = Promise.resolve(), pane
 async function send(request) {
   let reply;
   try {
-    reply = await fetch("edit", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(request) });
+    reply = await fetch("edit", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ scene: scene.number, request }) });
   } catch {
     throw new Error("The server does not answer; is splatvk view still running?");
   }
   const body = await reply.json();
+  if (reply.status === 409) await begin();
   if (!reply.ok) throw new Error(body.error);
   return body;
+}
+
+/// Begins again with the present scene, which was edited elsewhere.
+async function begin() {
+  [now, steps, undone] = [{ parts: [], selected: null, hidden: [] }, [], []];
+  forget();
+  await renew();
+  list = await send({ list: {} });
 }
 
 /// Does one thing after the other, and shows why one is refused.
@@ -97,7 +107,7 @@ const edit = (operation, word) => alone(async () => {
 });
 
 /// Undoes the last step of this page, or else the last edit of the scene.
-export const undo = () => alone(async () => {
+const undo = () => alone(async () => {
   const step = steps.at(-1);
   if (!step || step.edit) {
     if (!await change({ undo: {} })) return say("There is nothing to undo.");
@@ -107,7 +117,7 @@ export const undo = () => alone(async () => {
 });
 
 /// Does again the step that was undone last.
-export const redo = () => alone(async () => {
+const redo = () => alone(async () => {
   const step = undone.at(-1);
   if (!step || step.edit) {
     if (!await change({ redo: {} })) return say("There is nothing to redo.");
@@ -116,7 +126,7 @@ export const redo = () => alone(async () => {
   if (step) steps.push(undone.pop());
 });
 
-export const erase = () => now.selected && edit({ delete: {} }, "deleted");
+const erase = () => now.selected && edit({ delete: {} }, "deleted");
 
 /// Adds a part to the selection, or begins with it; Shift adds.
 function add(part) {
@@ -154,10 +164,9 @@ function ofCard() {
 
 // --- panel --------------------------------------------------------------------------------------
 
-/// Adds the panel where the server edits. `load` loads the splats again, `clear` takes away the
-/// selection of the card.
+/// Adds the panel; returns the actions of buttons and keys. `load` loads the splats again, `clear`
+/// takes away the selection of the card.
 export function connectEdit({ load, clear }) {
-  if (!manifest.edits) return;
   renew = load;
   panel = addPanel({ name: "edit", title: "Edit", fill, opened: () => alone(async () => { list = await send({ list: {} }); }), closed });
   const opener = find(".v-edit");
@@ -168,9 +177,8 @@ export function connectEdit({ load, clear }) {
     panel.show();
     select([{ ...part, combine: "add" }]);
   };
+  return { edit: panel.toggle, erase, undo, redo };
 }
-
-export const toggleEdit = () => panel?.toggle();
 
 function closed() {
   useTool();
@@ -196,20 +204,48 @@ function words() {
 }
 
 const PROPERTIES = ["opacity", "size", "reliability", "seen"];
-let bounds = { property: "opacity", least: "", most: "" };
+/// Property of the range, its distribution, and the edges between which splats are selected.
+let bounds = { property: "opacity", histogram: null, from: 0, to: 0 };
+
+const measure = (property) => alone(async () => {
+  bounds = { property, histogram: null, from: 0, to: 0 };
+  const histogram = await send({ histogram: property });
+  bounds = { property, histogram, from: 0, to: histogram.counts.length };
+});
+
+/// Value of a bound with its unit.
+function valueText(value) {
+  if (bounds.property === "size") return lengthText(value, manifest.metres);
+  return `${Number(value.toPrecision(2))}${bounds.property === "seen" ? " px" : ""}`;
+}
 
 function range() {
-  const number = (key, label) => make("input", { inputMode: "decimal", value: bounds[key], placeholder: label, "aria-label": label, oninput: (e) => { bounds[key] = e.target.value; } });
-  const select = make("select", { "aria-label": "Property", onchange: (e) => { bounds.property = e.target.value; } },
-    ...PROPERTIES.map((name) => make("option", { selected: name === bounds.property }, name)));
+  const { property, histogram, from, to } = bounds;
+  const select = make("select", { "aria-label": "Property", onchange: (e) => measure(e.target.value) },
+    make("option", { value: "", disabled: true, selected: !histogram }, "Range of …"),
+    ...PROPERTIES.map((name) => make("option", { selected: histogram && name === property }, name)));
+  if (!histogram) return make("form", {}, select);
+  const bins = histogram.counts.length, bars = make("div", { class: "v-bars", "aria-hidden": "true" }), said = make("output");
   const go = (e) => {
     e.preventDefault();
-    const value = (text) => (text.trim() ? Number(text.trim().replace(",", ".")) : undefined);
-    const [least, most] = [value(bounds.least), value(bounds.most)];
-    if (least === undefined && most === undefined || [least, most].some(Number.isNaN)) return say("Give a least or a most value, for example 0.1.");
-    add({ pick: { range: { property: bounds.property, least, most } } });
+    const edge = (at, open) => (at === open ? undefined : histogram.edges[at]);
+    add({ pick: { range: { property, least: edge(bounds.from, 0), most: edge(bounds.to, bins) } } });
   };
-  return make("form", { onsubmit: go }, select, number("least", "at least"), number("most", "at most"), make("button", { type: "submit" }, "Select"));
+  const most = Math.log1p(Math.max(...histogram.counts));
+  bars.append(...histogram.counts.map((count) => make("i", { style: `height: ${(100 * Math.log1p(count) / most).toFixed(0)}%` })));
+  const show = () => {
+    [...bars.children].forEach((bar, k) => bar.classList.toggle("in", k >= bounds.from && k < bounds.to));
+    said.value = `${valueText(histogram.edges[bounds.from])} to ${valueText(histogram.edges[bounds.to])}`;
+  };
+  const slider = (key, label, value) => make("input", { type: "range", min: 0, max: bins, step: 1, value, "aria-label": label, oninput: (e) => {
+    bounds[key] = Number(e.target.value);
+    bounds.from = Math.min(bounds.from, bounds.to - 1, bins - 1);
+    bounds.from = Math.max(0, bounds.from);
+    bounds.to = Math.max(bounds.to, bounds.from + 1);
+    show();
+  } });
+  show();
+  return make("form", { class: "v-range", onsubmit: go }, select, said, bars, slider("from", "Least", from), slider("to", "Most", to), make("button", { type: "submit" }, "Select"));
 }
 
 function summary() {

@@ -31,18 +31,16 @@ const REPORT_SPLATS: usize = 300_000;
 const THUMBNAIL: usize = 104;
 
 /// Import name and text of each module.
-const MODULES: [(&str, &str); 26] = [
+const MODULES: [(&str, &str); 23] = [
     ("splatvk/address", include_str!("address.js")),
     ("splatvk/camera", include_str!("camera.js")),
     ("splatvk/card", include_str!("card.js")),
     ("splatvk/controls", include_str!("controls.js")),
-    ("splatvk/edit", include_str!("edit.js")),
     ("splatvk/frame", include_str!("frame.js")),
     ("splatvk/measure", include_str!("measure.js")),
     ("splatvk/mesh", include_str!("mesh.js")),
     ("splatvk/motion", include_str!("motion.js")),
     ("splatvk/names", include_str!("names.js")),
-    ("splatvk/outline", include_str!("outline.js")),
     ("splatvk/page", include_str!("page.js")),
     ("splatvk/panel", include_str!("panel.js")),
     ("splatvk/pick", include_str!("pick.js")),
@@ -57,6 +55,12 @@ const MODULES: [(&str, &str); 26] = [
     ("splatvk/things", include_str!("things.js")),
     ("splatvk/views", include_str!("views.js")),
     ("splatvk/viewer", include_str!("viewer.js")),
+];
+
+/// Modules of a page that edits.
+const EDITING: [(&str, &str); 3] = [
+    ("splatvk/edit", include_str!("edit.js")),
+    ("splatvk/outline", include_str!("outline.js")),
     ("splatvk/widgets", include_str!("widgets.js")),
 ];
 
@@ -259,7 +263,8 @@ impl Scene3d<'_> {
 
     fn manifest(&self, ask_note: &str) -> Result<Value> {
         let views = self.cameras.iter().enumerate().map(|(i, c)| view(c, self.photos.get(i).copied()));
-        let standing = self.language.map(|l| Standing::of(self.layers.splats, l, self.cameras)).unwrap_or_default();
+        let standing =
+            self.language.map(|l| Standing::of(self.layers.splats, l, self.cameras)).unwrap_or_default();
         let words = self.language.is_some_and(|l| l.space.starts_with("words"));
         Ok(json!({
             "title": self.title, "live": false, "ask_note": ask_note,
@@ -323,8 +328,9 @@ fn slim(text: &str) -> String {
 /// Section of markup, data and modules. `<` is escaped, because it could end the script element.
 fn section(manifest: &Value, data: &str) -> String {
     let url = |text: &str| format!("data:text/javascript;base64,{}", STANDARD.encode(slim(text)));
+    let editing = EDITING.iter().filter(|_| manifest["edits"] == true);
     let imports: serde_json::Map<String, Value> =
-        MODULES.iter().map(|(name, text)| ((*name).to_owned(), url(text).into())).collect();
+        MODULES.iter().chain(editing).map(|(name, text)| ((*name).to_owned(), url(text).into())).collect();
     let manifest = manifest.to_string().replace('<', "\\u003c");
     format!(
         "{MARKUP}<script type=\"application/json\" id=\"v-manifest\">{manifest}</script>{data}\
@@ -342,15 +348,16 @@ mod tests {
     #[test]
     fn page_without_data_is_small() {
         use std::io::Write;
-        let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());
-        for (_, text) in MODULES {
-            gzip.write_all(slim(text).as_bytes()).unwrap();
-        }
-        gzip.write_all(STYLE.as_bytes()).unwrap();
-        gzip.write_all(MARKUP.as_bytes()).unwrap();
-        let size = gzip.finish().unwrap().len();
-        println!("{size} bytes");
-        assert!(size < 40_000, "{size} bytes");
+        let size = |modules: &[(&str, &str)]| {
+            let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::best());
+            modules.iter().for_each(|(_, text)| gzip.write_all(slim(text).as_bytes()).unwrap());
+            gzip.write_all(STYLE.as_bytes()).unwrap();
+            gzip.write_all(MARKUP.as_bytes()).unwrap();
+            gzip.finish().unwrap().len()
+        };
+        let (sent, edits) = (size(&MODULES), size(&[&MODULES[..], &EDITING].concat()));
+        println!("{sent} bytes, {edits} with edits");
+        assert!(sent < 40_000 && edits < 44_000, "{sent} and {edits} bytes");
         assert_eq!(slim("// a\n  x(); // b\n\n  // c\ny();\n"), "x(); // b\ny();\n");
     }
 
@@ -421,11 +428,15 @@ mod tests {
         let last = scene.served(&last).unwrap();
         assert!(last.contains("\"live\":true") && last.contains("\"renews\":false"));
         assert!(last.contains("\"saves\":true") && last.contains("\"total\":50"));
+        assert!(!last.contains("splatvk/edit\""));
+        let edits = Served { edits: true, ..server };
+        assert!(scene.served(&edits).unwrap().contains("splatvk/edit\""));
         // Every imported module exists.
-        for (_, text) in MODULES {
+        for (own, text) in MODULES.iter().chain(&EDITING) {
             for line in text.lines().filter(|l| l.starts_with("import ")) {
                 let name = line.split('"').nth(1).unwrap();
-                assert!(MODULES.iter().any(|(n, _)| *n == name), "{line}");
+                let has = |list: &[(&str, &str)], name: &str| list.iter().any(|(n, _)| *n == name);
+                assert!(has(&MODULES, name) || has(&EDITING, own) && has(&EDITING, name), "{line}");
             }
         }
     }

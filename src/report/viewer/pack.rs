@@ -19,8 +19,8 @@
 //!
 //! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block,
 //! which is a few neighbouring splats wide.
-use crate::math::{quaternion_norm, sigmoid};
 use crate::format::scene_dir::Scene;
+use crate::math::{quaternion_norm, sigmoid};
 use crate::query::instances;
 use crate::scene::{LanguageField, LevelField, SH_C0, Seen, Splats};
 use crate::{Error, Result};

@@ -178,7 +178,7 @@ void main() {
   if (alpha < 1.0 / 255.0) discard;
   vec3 shown = value.rgb;
   if (value.a < 0.0) {
-    float grey = mod(floor((gl_FragCoord.x - gl_FragCoord.y) / stripe), 2.0) < 0.5 ? ${HATCHING[0]} : ${HATCHING[1]};
+    float grey = mod(floor((gl_FragCoord.x - gl_FragCoord.y - 1.0) / stripe), 2.0) < 0.5 ? ${HATCHING[0]} : ${HATCHING[1]};
     shown = mode == ${MODES.relevancy} ? vec3(grey, 0.0, 0.0) : vec3(grey);
   }
   blended = vec4(shown * alpha, alpha);

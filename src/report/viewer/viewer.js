@@ -4,7 +4,6 @@ import { cameraOf, early, late } from "splatvk/address";
 import { Camera } from "splatvk/camera";
 import { fold, makeRoom } from "splatvk/card";
 import { button, controls, fullScreen } from "splatvk/controls";
-import { connectEdit, erase, redo, toggleEdit, undo } from "splatvk/edit";
 import { tellOuter } from "splatvk/frame";
 import { Tape } from "splatvk/measure";
 import { connectMesh, nextMesh } from "splatvk/mesh";
@@ -36,7 +35,7 @@ async function load() {
     await new Promise((go) => requestAnimationFrame(() => setTimeout(go)));
   }
   const packed = inline ? Uint8Array.from(atob(inline.textContent.trim()), (c) => c.charCodeAt(0))
-    : await download(manifest.scene, (share) => { wait.textContent = `Loading the scene … ${Math.floor(100 * share)} %`; });
+    : await fetchScene((share) => { wait.textContent = `Loading the scene … ${Math.floor(100 * share)} %`; });
   const splats = unpack(await gunzip(packed));
   inline?.remove();
   await named;
@@ -73,9 +72,15 @@ function photoCamera(name) {
   return camera;
 }
 
+/// Downloads the splats. Their number is asked first: the server takes an older one for outdated.
+async function fetchScene(tell) {
+  if (manifest.edits) scene.number = (await (await fetch("state")).json()).scene;
+  return download(manifest.scene, tell);
+}
+
 /// Loads the splats again, of the same scene; selection and answer stay.
 async function renew() {
-  await replace(unpack(await gunzip(await download(manifest.scene, () => {}))));
+  await replace(unpack(await gunzip(await fetchScene(() => {}))));
   restore();
 }
 
@@ -171,15 +176,13 @@ const actions = {
   full: () => fullScreen(root),
   measure: () => measure(),
   views: toggleViews,
-  edit: toggleEdit,
-  erase, undo, redo,
   mesh: nextMesh,
   help: () => find(".v-help").showModal(),
 };
 
 // --- connection ---------------------------------------------------------------------------------
 
-function connect() {
+async function connect() {
   if (manifest.renews) say("A preview: the scene sharpens while it is being made.", true);
   find(".v-modes").replaceChildren(...modes.map((m) => button(m.name, () => show(m.mode, m.level), { role: "radio", title: m.title ?? "" })));
   show("colour");
@@ -193,7 +196,8 @@ function connect() {
   connectBudget();
   connectQueries();
   connectMesh();
-  connectEdit({ load: renew, clear });
+  // A page that edits nothing lacks the module.
+  if (manifest.edits) Object.assign(actions, (await import("splatvk/edit")).connectEdit({ load: renew, clear }));
   connectViews({ goTo: (name) => scene.motion.goTo(namedCamera(name), -1) });
   const toView = (act) => (...given) => (root.scrollIntoView({ block: "nearest" }), act(...given));
   const selectCode = (level, code) => (setQuery(null), select(level, { codes: levels.map((_, at) => (at === level ? code : -1)) }));
@@ -228,6 +232,7 @@ function connectQueries() {
 window.splatvk = {
   ready: load().then(connect).then(() => late({ ask, show, modes, play: actions.play })),
   state,
+  marks: () => scene.splats.marks,
   camera: () => scene.motion.camera,
   tape,
   goTo: (view) => (scene.motion.goToView(view, true), settled()),

@@ -75,10 +75,8 @@ pub fn text(term: &Term) -> String {
             let bound = |sign: &str, value: &Option<f64>| value.map(|v| format!("{name}{sign}{v}"));
             [bound(">", least), bound("<", most)].into_iter().flatten().collect::<Vec<_>>().join(" & ")
         }
-        Pick::Click { camera, pixel: [x, y], .. } => format!("click at {x:.0}, {y:.0} of {}", camera.name),
-        Pick::Outline { camera, polygon, .. } => {
-            format!("outline of {} corners in {}", polygon.len(), camera.name)
-        }
+        Pick::Click { pixel: [x, y], .. } => format!("click at {x:.0}, {y:.0}"),
+        Pick::Outline { polygon, .. } => format!("outline of {} corners", polygon.len()),
         Pick::Floaters { thorough } => if *thorough { "thorough floaters" } else { "floaters" }.to_owned(),
     };
     sign.to_owned() + &pick

@@ -21,6 +21,7 @@ use crate::query::instances::Places;
 use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, Image, LanguageField};
 use crate::{Error, Result, gpu};
+pub use select::Histogram;
 use std::path::Path;
 use std::sync::Arc;
 

@@ -13,6 +13,20 @@ use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 use std::collections::HashSet;
 
+/// Number of bins of a histogram.
+const BINS: usize = 48;
+/// Smallest value of a logarithmic histogram: pixels, or scene units.
+const LEAST_SEEN: f64 = 1e-6;
+
+/// Distribution of a property.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Histogram {
+    /// [bins + 1] ascending.
+    pub edges: Vec<f64>,
+    /// [bins] numbers of splats.
+    pub counts: Vec<usize>,
+}
+
 /// Splats of a rule.
 #[derive(Default)]
 struct Found {
@@ -53,6 +67,9 @@ impl Editor {
     }
 
     fn pick(&mut self, pick: &Pick) -> Result<Found> {
+        if let Pick::Click { camera, .. } | Pick::Outline { camera, .. } = pick {
+            camera.clone().checked().map_err(Error::input)?;
+        }
         let sure = |rows: Vec<usize>| Found { rows, ..Found::default() };
         let of_level = |(rows, level): (Vec<usize>, usize)| Found { level: Some(level), ..sure(rows) };
         match pick {
@@ -122,8 +139,41 @@ impl Editor {
 
     /// Splats whose property is in a range.
     fn range(&self, property: Property, least: Option<f64>, most: Option<f64>) -> Result<Vec<usize>> {
+        let value = self.value(property)?;
+        let inside = |i: &usize| {
+            let value = value(*i);
+            least.is_none_or(|least| value >= least) && most.is_none_or(|most| value <= most)
+        };
+        Ok((0..self.scene.splats.len()).into_par_iter().filter(inside).collect())
+    }
+
+    /// Distribution of a property in the edited scene. Bins of size and seen are equally wide in the
+    /// logarithm.
+    ///
+    /// # Errors
+    /// A property that the scene does not state.
+    pub fn histogram(&self, property: Property) -> Result<Histogram> {
+        let value = self.value(property)?;
+        let by_factor = matches!(property, Property::Size | Property::Seen);
+        // Splats that no photo shows count in the first bin.
+        let scaled = |v: f64| if by_factor { v.max(LEAST_SEEN).ln() } else { v };
+        let values: Vec<f64> =
+            (0..self.scene.splats.len()).into_par_iter().map(|i| scaled(value(i))).collect();
+        let low = values.iter().copied().fold(f64::INFINITY, f64::min);
+        let high = values.iter().copied().fold(f64::NEG_INFINITY, f64::max).max(low + f64::EPSILON);
+        let mut counts = vec![0; BINS];
+        for v in values {
+            counts[((v - low) / (high - low) * BINS as f64).clamp(0.0, BINS as f64 - 1.0) as usize] += 1;
+        }
+        let edge = |k: usize| low + (high - low) * k as f64 / BINS as f64;
+        let edges = (0..=BINS).map(|k| if by_factor { edge(k).exp() } else { edge(k) }).collect();
+        Ok(Histogram { edges, counts })
+    }
+
+    /// A property by the row of a splat.
+    fn value(&self, property: Property) -> Result<Box<dyn Fn(usize) -> f64 + Sync + '_>> {
         let scene = &self.scene;
-        let value: Box<dyn Fn(usize) -> f64 + Sync> = match property {
+        Ok(match property {
             Property::Opacity => Box::new(|i| 1.0 / (1.0 + f64::from(-scene.splats.opacity_logits[i]).exp())),
             Property::Size => {
                 Box::new(|i| f64::from(scene.splats.log_scales[i].into_iter().fold(f32::MIN, f32::max)).exp())
@@ -140,12 +190,7 @@ impl Editor {
                 })?;
                 Box::new(|i| f64::from(values[i]))
             }
-        };
-        let inside = |i: &usize| {
-            let value = value(*i);
-            least.is_none_or(|least| value >= least) && most.is_none_or(|most| value <= most)
-        };
-        Ok((0..scene.splats.len()).into_par_iter().filter(inside).collect())
+        })
     }
 
     fn unknown(&self, reason: &str) -> Error {
@@ -182,7 +227,8 @@ impl Editor {
             let squares = group.splats.iter().map(|i| DVec3::from(means[*i].map(f64::from)));
             squares.map(|mean| mean.distance_squared(place)).fold(f64::INFINITY, f64::min)
         };
-        let nearest = (0..groups.len()).min_by(|a, b| distance(&groups[*a]).total_cmp(&distance(&groups[*b])));
+        let nearest =
+            (0..groups.len()).min_by(|a, b| distance(&groups[*a]).total_cmp(&distance(&groups[*b])));
         // Specks of the code that are no thing of their own go with the clicked one, as with a word.
         let others = groups.iter().enumerate().filter(|(k, _)| Some(*k) != nearest);
         let others: HashSet<usize> = others.flat_map(|(_, group)| group.splats.iter().copied()).collect();
