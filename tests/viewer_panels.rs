@@ -143,9 +143,9 @@ fn broken(page: &mut Page) -> Value {
     )
 }
 
-/// Controls that reach out of the screen, rows that scroll excepted.
+/// Controls that reach out of the screen, rows and panels that scroll excepted.
 const OUTSIDE: &str = "[...document.querySelectorAll('.viewer button, .viewer input')].filter((e) => e.offsetParent && \
-    !e.closest('dialog, .v-photos, .v-chips')).filter((e) => { const r = e.getBoundingClientRect(); \
+    !e.closest('dialog, .v-photos, .v-chips, .v-panel > div')).filter((e) => { const r = e.getBoundingClientRect(); \
     return r.left < 0 || r.top < 0 || r.right > innerWidth || r.bottom > innerHeight; }).map((e) => e.outerHTML.slice(0, 80))";
 
 #[test]

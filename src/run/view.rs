@@ -149,9 +149,18 @@ impl Viewer {
             let first = shown.last().map_or(0, |r| r.end);
             shown.push(first..first + level.features.len() / splats.len().max(1));
         }
-        let (own, shared): (Vec<usize>, Vec<usize>) = (0..shown.len())
-            .filter(|&l| !shown[l].is_empty())
-            .partition(|&l| field.levels[l].splats.is_some());
+        let (mut own, mut shared) = (Vec::new(), Vec::new());
+        // A level whose features the device cannot bind with those of the others gets a model, too.
+        let mut room = device.info().max_storage_range / 4 / splats.len().max(1) as u64;
+        for level in (0..shown.len()).filter(|&l| !shown[l].is_empty()) {
+            let channels = shown[level].len() as u64;
+            if field.levels[level].splats.is_none() && (shared.is_empty() || channels <= room) {
+                shared.push(level);
+                room = room.saturating_sub(channels);
+            } else {
+                own.push(level);
+            }
+        }
         let mut models = vec![Model::new(device, splats, field, &shared, &shown)?];
         for level in own {
             let carrier = field.levels[level].carrier(splats);

@@ -187,9 +187,10 @@ function closed() {
 
 function fill() {
   useTool();
-  return [choice("How to combine", HOW, how, (value) => { how = value; }), words(), choice("Tool in the picture", TOOLS, tool, (value) => { tool = value; }),
-    tool === "click" ? "" : make("label", { class: "v-check" }, make("input", { type: "checkbox", checked: through, onchange: (e) => { through = e.target.checked; } }), "also what is hidden behind"),
-    range(), summary(), actions(), history()];
+  const behind = make("input", { type: "checkbox", checked: through, onchange: (e) => { through = e.target.checked; } });
+  return [words(), choice("Tool in the picture", TOOLS, tool, (value) => { tool = value; }),
+    tool === "click" ? "" : make("label", { class: "v-check" }, behind, "also what is hidden behind"),
+    choice("How to combine", HOW, how, (value) => { how = value; }), summary(), actions(), range(), history()];
 }
 
 function choice(label, all, chosen, choose) {
@@ -215,7 +216,7 @@ const measure = (property) => alone(async () => {
 
 /// Value of a bound with its unit.
 function valueText(value) {
-  if (bounds.property === "size") return lengthText(value, manifest.metres);
+  if (bounds.property === "size") return lengthText(value, manifest.metres, 2);
   return `${Number(value.toPrecision(2))}${bounds.property === "seen" ? " px" : ""}`;
 }
 

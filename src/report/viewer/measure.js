@@ -3,11 +3,9 @@ import { sub } from "splatvk/camera";
 
 const ENDS = ["A", "B"];
 
-/// Rounds to four digits, the accuracy of a click.
-const short = (value) => Number(value.toPrecision(4));
-
-/// Formats a length with its unit.
-export function lengthText(units, metres) {
+/// Formats a length with its unit; a click is accurate to four digits.
+export function lengthText(units, metres, digits = 4) {
+  const short = (value) => Number(value.toPrecision(digits));
   if (!metres) return `${short(units)} units`;
   const m = units * metres;
   if (m < 0.01) return `${short(1000 * m)} mm`;

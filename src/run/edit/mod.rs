@@ -10,7 +10,7 @@ use super::ask::QueryScene;
 use super::encoder;
 use super::plan::Machine;
 use super::view;
-use crate::format::edits::{Edit, EditList, Operation, Rows, Term};
+use crate::format::edits::{self, Edit, EditList, Operation, Rows, Term};
 use crate::format::scene_dir::{self, Scene};
 use crate::infer::RegionEncoder;
 use crate::pass::renderer::Renderer;
@@ -21,9 +21,11 @@ use crate::query::instances::Places;
 use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, Image, LanguageField};
 use crate::{Error, Result, gpu};
+use rayon::prelude::*;
 pub use select::Histogram;
 use std::path::Path;
 use std::sync::Arc;
+use std::time::SystemTime;
 
 /// Part of its blending weight without the splats in front of it up to which a splat is hidden. On
 /// breakfast a deleted mug leaves blobs with 0.1 and none with 0.2.
@@ -65,6 +67,8 @@ pub struct Editor {
     /// The scene as it was reconstructed.
     whole: Arc<Scene>,
     list: EditList,
+    /// Time stamp of the file of `list`.
+    stamp: Option<SystemTime>,
     /// The scene after its edits.
     scene: Arc<Scene>,
     /// State of selections, made by the first one that needs it.
@@ -80,6 +84,8 @@ struct Lookup {
     words: Option<QueryScene>,
     /// Depth of the splats, on the device.
     surface: Option<Renderer>,
+    /// The last view of it: outlines follow each other from one camera.
+    depth: Option<(Camera, Image<f32>)>,
     standing: Option<Standing>,
     /// Places of a scene without language.
     places: Option<Places>,
@@ -97,11 +103,12 @@ impl Editor {
                 path.display()
             )));
         }
-        let whole = scene_dir::load_unedited(path)?;
+        let whole = Arc::new(scene_dir::load_unedited(path)?);
+        let stamp = stamp(path);
         let list = EditList::read(path, &whole.splats)?;
-        let whole = Arc::new(whole);
         let scene = edited(&whole, &list);
-        Ok(Editor { machine: machine.clone(), fixed: None, whole, list, scene, lookup: Lookup::default() })
+        let (machine, lookup) = (machine.clone(), Lookup::default());
+        Ok(Editor { machine, fixed: None, whole, list, stamp, scene, lookup })
     }
 
     /// A loaded scene for selections and questions. Edits are refused with a reason.
@@ -113,6 +120,7 @@ impl Editor {
             scene: whole.clone(),
             whole,
             list,
+            stamp: None,
             lookup: Lookup::default(),
         }
     }
@@ -122,10 +130,12 @@ impl Editor {
     /// # Errors
     /// A list that cannot be read; the present one stays then.
     pub fn reload(&mut self) -> Result<bool> {
-        let list = match self.fixed {
-            Some(_) => return Ok(false),
-            None => EditList::read(&self.whole.path, &self.whole.splats)?,
-        };
+        let stamp = stamp(&self.whole.path);
+        if self.fixed.is_some() || stamp == self.stamp {
+            return Ok(false);
+        }
+        let list = EditList::read(&self.whole.path, &self.whole.splats)?;
+        self.stamp = stamp;
         let differs = list != self.list;
         if differs {
             let scene = edited(&self.whole, &list);
@@ -154,9 +164,12 @@ impl Editor {
         if rows.is_empty() {
             return Err(Error::input(format!("{}: selects no splat of the scene", expression::texts(terms))));
         }
-        let opacity = |i: usize| 1.0 / (1.0 + f64::from(-self.scene.splats.opacity_logits[i]).exp());
-        let all: f64 = (0..self.scene.splats.len()).map(opacity).sum();
-        let share = rows.iter().map(|i| opacity(*i)).sum::<f64>() / all.max(f64::MIN_POSITIVE);
+        let logits = &self.scene.splats.opacity_logits;
+        let opacity = |logit: &f32| 1.0 / (1.0 + f64::from(-logit).exp());
+        // Parts in their order: the sum does not depend on the threads.
+        let parts = logits.par_chunks(1 << 16).map(|part| part.iter().map(opacity).sum());
+        let all: f64 = parts.collect::<Vec<f64>>().iter().sum();
+        let share = rows.iter().map(|i| opacity(&logits[*i])).sum::<f64>() / all.max(f64::MIN_POSITIVE);
         let count = rows.len();
         let rows = match &self.scene.edits {
             Some(edits) => edits.originals(rows),
@@ -222,7 +235,11 @@ impl Editor {
         if let Some(reason) = &self.fixed {
             return Err(Error::input(reason.clone()));
         }
-        list.replace(&self.list, &self.whole)?;
+        let replaced = list.replace(&self.list, &self.whole);
+        // After a refusal the next reload reads the file in any case.
+        self.stamp = None;
+        replaced?;
+        self.stamp = stamp(&self.whole.path);
         self.take(list, scene);
         Ok(())
     }
@@ -299,12 +316,17 @@ impl Editor {
 
     /// Depth of a view, scene units; 0 where nothing is.
     fn depth(&mut self, camera: &Camera) -> Result<Image<f32>> {
+        if let Some((_, depth)) = self.lookup.depth.as_ref().filter(|(known, _)| known == camera) {
+            return Ok(depth.clone());
+        }
         if self.lookup.surface.is_none() {
             let device = gpu::open(self.machine.device.as_deref())?;
             self.lookup.surface = Some(Renderer::new(&device, &self.scene.splats.bare(), &[], 0)?);
         }
         let renderer = self.lookup.surface.as_mut().ok_or_else(|| Error::work("no renderer"))?;
-        Ok(renderer.render(camera)?.depth)
+        let depth = renderer.render(camera)?.depth;
+        self.lookup.depth = Some((camera.clone(), depth.clone()));
+        Ok(depth)
     }
 
     /// Positions of the splats, with their codes where the scene has language.
@@ -317,6 +339,11 @@ impl Editor {
             }),
         }
     }
+}
+
+/// Time stamp of the edits of a scene directory; `None` without.
+fn stamp(scene: &Path) -> Option<SystemTime> {
+    scene.join(edits::FILE).metadata().ok()?.modified().ok()
 }
 
 /// The scene after the edits of a list; without any it is shared.
