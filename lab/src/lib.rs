@@ -1,6 +1,6 @@
 //! The laboratory of splatvk: the tables of the paper's experiments ([`ablate`]), its pictures
 //! ([`figures`]), data with ground truth ([`generate`]), the alignment alone ([`alignment`]),
-//! quality against seconds of training ([`curve`]), evaluation protocols ([`protocol`]), and their
+//! quality against seconds of training ([`curve`]), panoptic quality ([`panoptic`]), evaluation protocols ([`protocol`]), and their
 //! commands ([`cli`], program `splatlab`). It is not part of the installed program.
 #![warn(missing_docs)]
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
@@ -12,6 +12,7 @@ pub mod cli;
 pub mod curve;
 pub mod figures;
 pub mod generate;
+pub mod panoptic;
 pub mod protocol;
 
 pub use splatvk::{Error, Result};

@@ -44,6 +44,8 @@ pub enum Command {
     Ask(AskArgs),
     /// Mesh of a scene against true depth → accuracy, precision, recall, F1
     MeshAccuracy(MeshAccuracyArgs),
+    /// Things of scenes against the objects of held-out views → panoptic quality
+    ObjectAccuracy(ObjectAccuracyArgs),
 }
 
 /// Published protocols.
@@ -155,6 +157,20 @@ pub struct MeshAccuracyArgs {
     /// Also surfaces that no photo shows
     #[arg(long)]
     pub fill_guessed: bool,
+    /// Device and models
+    #[command(flatten)]
+    pub device: DeviceArgs,
+}
+
+/// `splatlab object-accuracy`
+#[derive(Debug, Args)]
+pub struct ObjectAccuracyArgs {
+    /// Scene directories; their segments are scored together
+    #[arg(required = true)]
+    pub scenes: Vec<PathBuf>,
+    /// Folder with ground_truth.json and masks, one per scene
+    #[arg(long, value_name = "DIR", required = true)]
+    pub ground_truth: Vec<PathBuf>,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,

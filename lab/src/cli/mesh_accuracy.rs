@@ -49,7 +49,7 @@ fn views(truth: &GroundTruth, wanted: impl Fn(Split) -> bool) -> Result<Vec<True
 }
 
 /// Scene → truth, from the cameras of the photos.
-fn similarity(truth: &GroundTruth, scene: &Scene) -> Result<Similarity> {
+pub(super) fn similarity(truth: &GroundTruth, scene: &Scene) -> Result<Similarity> {
     let (mut found, mut known): (Vec<Camera>, Vec<Camera>) = (Vec::new(), Vec::new());
     for frame in truth.frames.iter().filter(|f| f.split == Split::Train) {
         if let Some(camera) = scene.cameras.iter().find(|c| stem(&c.name) == frame.stem) {

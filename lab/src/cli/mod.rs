@@ -10,6 +10,7 @@ mod figures;
 mod generate;
 mod ghosts;
 mod mesh_accuracy;
+mod object_accuracy;
 mod study;
 
 use crate::Result;
@@ -31,6 +32,7 @@ impl Program for Lab {
         ("ghosts", &["provider", "log"]),
         ("alignment", &["provider"]),
         ("mesh-accuracy", &["provider"]),
+        ("object-accuracy", &["provider"]),
     ];
 
     fn log(&self) -> LogFormat {
@@ -59,6 +61,7 @@ impl Program for Lab {
                 eval::eval(&args)
             }
             Command::MeshAccuracy(args) => mesh_accuracy::mesh_accuracy(&args),
+            Command::ObjectAccuracy(args) => object_accuracy::object_accuracy(&args),
             Command::Ask(mut args) => {
                 args.device.provider = self.global.provider;
                 ask::ask(&args)

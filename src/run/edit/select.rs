@@ -249,9 +249,13 @@ impl Editor {
             }
         };
         let means = &self.scene.splats.means;
+        let corners = || polygon.iter().map(|corner| DVec2::from_array(*corner));
+        let (low, high) =
+            (corners().fold(DVec2::INFINITY, DVec2::min), corners().fold(-DVec2::INFINITY, DVec2::max));
         let inside = |i: &usize| {
             let (pixel, z) = camera.project(DVec3::from_array(means[*i].map(f64::from)));
-            z > 0.0 && is_inside(polygon, pixel)
+            // Most splats are outside of the box already.
+            z > 0.0 && pixel.cmpge(low).all() && pixel.cmple(high).all() && is_inside(polygon, pixel)
         };
         Ok(shown.into_par_iter().filter(inside).collect())
     }

@@ -19,6 +19,12 @@ impl Similarity {
         self.rotation * p * self.scale + self.translation
     }
 
+    /// The transform back.
+    pub fn inverse(&self) -> Similarity {
+        let (scale, rotation) = (1.0 / self.scale, self.rotation.transpose());
+        Similarity { scale, rotation, translation: rotation * self.translation * -scale }
+    }
+
     /// Camera with the same image of the transformed points as `camera` has of the original ones.
     pub fn camera(&self, camera: &Camera) -> Camera {
         let rotation = camera.pose.rotation * self.rotation.transpose();
@@ -50,5 +56,7 @@ mod tests {
         let (pixel, depth) = (DVec2::new(12.0, 401.0), 3.5);
         let (seen, z) = by.camera(&camera).project(by.transform(camera.unproject(pixel, depth)));
         assert!((seen - pixel).length() < 1e-9 && (z - 2.5 * depth).abs() < 1e-9);
+        let point = DVec3::new(3.0, -0.2, 7.0);
+        assert!(by.inverse().transform(by.transform(point)).distance(point) < 1e-12);
     }
 }
