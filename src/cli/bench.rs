@@ -1,7 +1,6 @@
 //! `splatvk bench`
 use super::args::{BenchArgs, BenchPart, EditUse};
 use super::models::check_text;
-use super::outputs::{WrittenFile, WrittenFiles};
 use super::print::{listing, print};
 use super::progress;
 use super::scene;
@@ -12,6 +11,7 @@ use crate::infer::check::check as check_model;
 use crate::infer::installed::inventory;
 use crate::infer::{RegionEncoder, Registry};
 use crate::run::encoder;
+use crate::run::outputs::{WrittenFile, WrittenFiles};
 use crate::{Error, Result};
 use std::path::Path;
 

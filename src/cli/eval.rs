@@ -1,6 +1,5 @@
 //! `splatvk eval`
 use super::args::{DeviceArgs, EvalArgs};
-use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::{moved, progress, scene};
 use crate::eval::{EvalReport, Evaluation, GroundTruth};
@@ -11,6 +10,7 @@ use crate::query::TextQuery;
 use crate::run::Compat;
 use crate::run::ask;
 use crate::run::encoder;
+use crate::run::outputs::WrittenFiles;
 use crate::run::score::{Questions, ScoredScene, score_field};
 use crate::scene::LanguageField;
 use crate::{Error, Result};

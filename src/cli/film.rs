@@ -1,6 +1,5 @@
 //! `splatvk render --path … --out FILE.mp4`: a film along a path, or its frames as PNG.
 use super::args::{PathKind, RenderArgs};
-use super::outputs::{WrittenFile, WrittenFiles};
 use super::print::{listing, print, print_json};
 use super::progress;
 use super::scene;
@@ -9,6 +8,7 @@ use crate::format::scene_dir::Scene;
 use crate::gpu;
 use crate::photo::VideoWriter;
 use crate::run::orbit::Orbit;
+use crate::run::outputs::{WrittenFile, WrittenFiles};
 use crate::run::path::{CameraPath, PathViews};
 use crate::run::view::{UnseenShare, Viewer};
 use crate::scene::{Camera, LanguageField, RgbImage};

@@ -6,9 +6,7 @@ use super::progress;
 use crate::infer::installed::inventory;
 use crate::run::config::MASK_POINTS;
 use crate::run::sources::{self, FeatureSources, MaskSources, SourceChoice};
-use crate::run::{
-    self, GeometryConfig, Inputs, LanguageConfig, ReconstructionConfig, RunPlan, TrainingConfig,
-};
+use crate::run::{self, Inputs, LanguageConfig, RunPlan};
 use crate::{Error, Result, files, photo};
 use clap::Args;
 use std::path::{Path, PathBuf};
@@ -78,21 +76,14 @@ pub fn label(args: &LabelArgs) -> Result<()> {
 }
 
 fn plan(args: &LabelArgs) -> Result<RunPlan> {
-    let init = args.cameras.as_ref().map(|file| SourceChoice::with("cameras", file));
-    let config = ReconstructionConfig {
-        geometry: GeometryConfig {
-            init: init.unwrap_or_else(|| SourceChoice::named("sfm")),
-            depth_prior: SourceChoice::named("none"),
-        },
-        training: TrainingConfig { max_size: args.max_size, ..TrainingConfig::default() },
-        language: Some(LanguageConfig {
-            masks: args.masks.clone(),
-            features: args.features.clone(),
-            mask_points: args.mask_points,
-            no_mask_crops: args.no_mask_crops,
-            ..LanguageConfig::default()
-        }),
+    let language = LanguageConfig {
+        masks: args.masks.clone(),
+        features: args.features.clone(),
+        mask_points: args.mask_points,
+        no_mask_crops: args.no_mask_crops,
+        ..LanguageConfig::default()
     };
+    let config = run::label::config(args.cameras.clone(), args.max_size, language);
     Ok(RunPlan {
         inputs: Inputs {
             photos: args.images.iter().cloned().collect(),

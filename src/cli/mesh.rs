@@ -1,20 +1,14 @@
 //! `splatvk mesh`: surfaces of a scene as triangles.
 use super::args::{DeviceArgs, EditUse};
-use super::outputs::WrittenFile;
 use super::print::{print, print_json};
-use super::progress;
-use super::scene::{self, scene_name};
-use super::{objects, views};
-use crate::format::mesh::{self as files, MeshFile, MeshFormat};
-use crate::format::scene_dir::Scene;
-use crate::run::mesh::{self, MeshOptions, Placement, SceneMesh, Things};
+use super::{objects, progress, scene, views};
+use crate::Result;
+use crate::format::mesh::MeshFormat;
+use crate::run::mesh::{MeshPlan, TRIANGLES};
 use crate::run::metric::Distance;
-use crate::run::objects::ObjectOptions;
-use crate::scene::{LEVEL_NAMES, Mesh, World};
-use crate::{Error, Result};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
-use splatvk_mesh::{Collider, Simplify};
+use splatvk_mesh::Collider;
 use std::path::{Path, PathBuf};
 
 /// `splatvk mesh`
@@ -28,7 +22,7 @@ pub struct MeshArgs {
     #[arg(long, value_enum, value_name = "FORMAT")]
     pub format: Option<FormatKind>,
     /// Most triangles
-    #[arg(long, default_value_t = 100_000, value_parser = super::args::whole::<usize>(1..=100_000_000), value_name = "N")]
+    #[arg(long, default_value_t = TRIANGLES, value_parser = super::args::whole::<usize>(1..=100_000_000), value_name = "N")]
     pub triangles: usize,
     /// Simplify as far as 99.9 % of the surface moves by at most this length, instead of to a number
     /// of triangles: 2mm, 0.5cm, or a number in the units of the scene
@@ -78,6 +72,23 @@ pub enum FormatKind {
     Obj,
 }
 
+impl MeshArgs {
+    fn plan(&self) -> Result<MeshPlan> {
+        Ok(MeshPlan {
+            format: self.format.map(MeshFormat::from),
+            triangles: self.triangles,
+            error: self.error,
+            voxel: self.voxel,
+            fill_guessed: self.fill_guessed,
+            collider: self.collider.kind(),
+            by_object: self.by_object,
+            vocabulary: self.vocabulary.as_deref().map(objects::vocabulary).transpose()?,
+            cameras: self.cameras.as_deref().map(views::read).transpose()?,
+            raw: self.raw,
+        })
+    }
+}
+
 impl From<FormatKind> for MeshFormat {
     fn from(kind: FormatKind) -> MeshFormat {
         match kind {
@@ -117,93 +128,16 @@ fn positive(text: &str) -> Result<Distance, String> {
 }
 
 pub fn mesh(args: &MeshArgs) -> Result<()> {
-    let format = args.format.map_or_else(|| MeshFormat::of(&args.file), |kind| Ok(kind.into()))?;
-    if args.collider != ColliderKind::None && !format.has_colliders() {
-        return Err(Error::input("--collider: a .ply holds one mesh; write a .glb or .obj"));
-    }
-    let inputs: Vec<&Path> = [Some(&args.scene), args.cameras.as_ref(), args.vocabulary.as_ref()]
-        .into_iter()
-        .flatten()
-        .map(PathBuf::as_path)
-        .collect();
-    let out = WrittenFile::open(&args.file, args.force, &inputs)?;
-    let mut scene = scene::load(&args.scene, args.edits)?;
-    let things = if args.by_object { Some(things(&mut scene, args)?) } else { None };
-    let given = args.cameras.as_deref().map(views::read).transpose()?;
-    let cameras = given.as_deref().unwrap_or(&scene.cameras);
-    let name = scene_name(&args.scene);
-    let options = options(args, &scene)?;
-    let progress = progress::reporter();
-    let device = args.device.device.as_deref();
-    let made = mesh::mesh(&scene, cameras, things.as_ref(), &name, options, device, progress.as_ref())?;
-    let placement = match args.raw {
-        true => Placement::own(format.is_y_up()),
-        false => Placement::standing(&made.mesh, &scene.world),
-    };
-    let mut placed = mesh::placed(&made.mesh, &placement.by);
-    if let Some(collider) = args.collider.kind() {
-        mesh::add_colliders(&mut placed, collider);
-    }
-    progress.check()?;
-    let figures = figures(&made, &placed, &placement, &scene.world, args);
-    let file = MeshFile { name: &name, own_origins: things.is_some(), extras: figures.clone() };
-    out.keep(|path| files::write(path, &placed, format, &file))?;
+    let inputs = [Some(&args.scene), args.cameras.as_ref(), args.vocabulary.as_ref()].into_iter().flatten();
+    let inputs: Vec<&Path> = inputs.map(PathBuf::as_path).collect();
+    let plan = args.plan()?;
+    let out = plan.reserve(&args.file, args.force, &inputs)?;
+    let scene = scene::load(&args.scene, args.edits)?;
+    let figures = out.write(scene, &args.device.machine(), progress::reporter().as_ref())?;
     match args.device.json {
         true => print_json(&with_file(figures, &args.file)),
         false => print(&line(&figures, &args.file)),
     }
-}
-
-/// The things of a scene as a whole, for `--by-object`.
-fn things(scene: &mut Scene, args: &MeshArgs) -> Result<Things> {
-    let vocabulary = args.vocabulary.as_deref().map(objects::vocabulary).transpose()?;
-    let options = ObjectOptions { vocabulary, ..ObjectOptions::default() };
-    let (_, list) = objects::listed(scene, &args.device, &options)?;
-    let whole = LEVEL_NAMES.len() - 1;
-    let mut things = Things { object: vec![0; scene.splats.len()], names: Vec::new() };
-    for object in list.into_iter().filter(|o| o.thing.level == whole) {
-        things.names.push(object.name);
-        let number = things.names.len() as u32;
-        object.thing.instance.splats.iter().for_each(|i| things.object[*i] = number);
-    }
-    Ok(things)
-}
-
-fn options(args: &MeshArgs, scene: &Scene) -> Result<MeshOptions> {
-    let units = |length: Option<Distance>| length.map(|l| l.in_units(scene)).transpose();
-    Ok(MeshOptions {
-        voxel: units(args.voxel)?,
-        simplify: units(args.error)?.map_or(Simplify::Triangles(args.triangles), Simplify::Error),
-        fill_guessed: args.fill_guessed,
-    })
-}
-
-/// Figures of a mesh, lengths in the units of the file.
-fn figures(made: &SceneMesh, placed: &Mesh, placement: &Placement, world: &World, args: &MeshArgs) -> Value {
-    let scale = placement.by.scale;
-    let up = world.up.as_ref().filter(|_| placement.upright);
-    let (low, high) = placed.extent().unwrap_or_default();
-    let size = [0, 1, 2].map(|k| high[k] - low[k]);
-    json!({
-        "from_scene": {
-            "scale": scale,
-            "rotation": placement.by.rotation.transpose().to_cols_array(),
-            "translation": placement.by.translation.to_array(),
-        },
-        "unit": if placement.metric { "metre" } else { "scene unit" },
-        "up": if args.raw { "as in the scene" } else if placement.upright { "y" } else { "unknown" },
-        "up_sigma_degrees": up.map(|up| up.sigma_degrees),
-        "triangles": placed.triangles.len(),
-        "vertices": placed.positions.len(),
-        "parts": placed.parts.len(),
-        "size": size,
-        "area": made.area * scale * scale,
-        "border_edges": made.border_edges,
-        "voxel": made.voxel * scale,
-        "moved": made.moved * scale,
-        "views": made.views,
-        "guessed": args.fill_guessed,
-    })
 }
 
 fn with_file(mut figures: Value, file: &Path) -> Value {

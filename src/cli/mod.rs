@@ -18,7 +18,6 @@ mod measure;
 mod mesh;
 mod models;
 mod objects;
-pub mod outputs;
 mod path;
 pub mod print;
 pub mod progress;

@@ -1,11 +1,11 @@
 //! `splatvk render --path`: views between and beside the photos, with their figures.
 use super::args::PathKind;
-use super::outputs::WrittenFiles;
 use crate::Result;
 use crate::eval::ShownScore;
 use crate::format::picture;
 use crate::photo::VideoWriter;
 use crate::progress::Progress;
+use crate::run::outputs::WrittenFiles;
 use crate::run::path::{CameraPath, FRAMES_PER_SEGMENT, PathViews, fitted, sheet};
 use crate::run::view::{DecodedFrame, Viewer};
 use crate::scene::{Camera, RgbImage};

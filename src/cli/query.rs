@@ -1,7 +1,6 @@
 //! `splatvk query`
 use super::args::QueryArgs;
 use super::line::one_line;
-use super::outputs::WrittenFiles;
 use super::print::{print, print_json};
 use super::progress;
 use super::scene;
@@ -24,6 +23,7 @@ use crate::run::answer::{self, Answers};
 use crate::run::ask::QueryScene;
 use crate::run::concepts::{self, ConceptScene};
 use crate::run::encoder;
+use crate::run::outputs::WrittenFiles;
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, Splats, World};
 use crate::{Error, Result};
 use glam::DVec2;

@@ -1,7 +1,6 @@
 //! `splatvk render`
 use super::args::{Channel, ImageFormat, RenderArgs};
 use super::film;
-use super::outputs::WrittenFiles;
 use super::path::PathOutput;
 use super::print::{listing, print, print_json};
 use super::progress;
@@ -13,6 +12,7 @@ use crate::format::views::Views;
 use crate::gpu;
 use crate::photo::VideoWriter;
 use crate::report::colour;
+use crate::run::outputs::WrittenFiles;
 use crate::run::path::PathViews;
 use crate::run::view::{DecodedFrame, UnseenShare, Viewer};
 use crate::scene::{Camera, Image, LEVEL_NAMES, LanguageField, RgbImage, to_linear};

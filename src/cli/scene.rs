@@ -1,10 +1,9 @@
 //! Loading of scenes for commands.
 use super::args::EditUse;
 use super::progress;
+use crate::Result;
 use crate::format::scene_dir::{self, Scene};
-use crate::format::scene_photos;
-use crate::scene::{Camera, RgbImage};
-use crate::{Result, photo};
+pub use crate::run::stored::{photos, title};
 use std::path::Path;
 
 /// Loads a scene directory or a file of Gaussians, and prints its warnings and the number of its
@@ -29,25 +28,4 @@ pub fn remark(path: &Path, scene: &Scene) {
         ));
     }
     scene.warnings.iter().for_each(|note| progress::print_warning(note));
-}
-
-/// Photos of a scene's cameras. They are optional: a scene without its images, or with images
-/// elsewhere, has none here.
-pub fn photos(scene: &Scene) -> Vec<RgbImage> {
-    let load = |c: &Camera| photo::load_at(&scene_photos::picture(&scene.path, c)?, usize::MAX).ok();
-    let photos: Option<Vec<_>> = scene.cameras.iter().map(load).collect();
-    photos.unwrap_or_default().into_iter().map(|p| p.image).collect()
-}
-
-/// Title of a scene's page: the name of its folder or file.
-pub fn title(path: &Path) -> String {
-    let path = path.canonicalize().unwrap_or_else(|_| path.to_owned());
-    path.file_stem().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
-}
-
-/// Name of a scene: that of its folder or file.
-pub fn scene_name(path: &Path) -> String {
-    let whole = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
-    let name = whole.file_stem().map(|n| n.to_string_lossy().into_owned());
-    name.unwrap_or_else(|| "scene".to_owned())
 }

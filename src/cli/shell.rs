@@ -1,8 +1,8 @@
 //! `splatvk completions`, `splatvk manuals`: files that tools/install puts beside the program.
 use super::args::{Cli, CompletionsArgs, ManualsArgs};
-use super::outputs::WrittenFiles;
 use super::print::print;
 use super::usage;
+use crate::run::outputs::WrittenFiles;
 use crate::{Error, Result};
 
 pub fn completions(args: &CompletionsArgs) -> Result<()> {

@@ -7,6 +7,9 @@ use crate::{Error, Result};
 /// Loads the text encoder of a scene: for precomputed features the scene's table of text embeddings
 /// with a network, else the model that the scene was made with.
 pub fn of_scene(scene: &Scene, registry: Registry) -> Result<Box<dyn RegionEncoder>> {
+    if scene.path.as_os_str().is_empty() {
+        return Err(Error::input("the scene is not stored anywhere; save it first, its words are there"));
+    }
     let table = scene.path.join(TEXT_EMBEDDINGS);
     let levels = scene.language.iter().flat_map(|l| &l.levels);
     let dim = levels.map(|l| l.codebook.embedding_dim).find(|dim| *dim > 0);

@@ -5,6 +5,7 @@ use super::ask::QuerySession;
 use super::compat::{Compat, query_options};
 use super::execute::save;
 use super::outcome::RunOutcome;
+use super::plan::Machine;
 use super::view::{DecodedFrame, FeatureChannels, Viewer};
 use super::{encoder, sources};
 use crate::files::check_spared;
@@ -106,6 +107,10 @@ impl LiveScene {
         })
     }
 
+    /// Device and models of the scene.
+    pub fn machine(&self) -> Machine {
+        Machine::of(self.device.clone(), self.registry.clone())
+    }
     /// Device of the scene.
     pub fn device(&self) -> &Device {
         &self.device
@@ -152,6 +157,30 @@ impl LiveScene {
             SceneOrigin::Loaded(s) => &s.warnings,
         }
     }
+    /// Path of the scene directory or file; empty for a scene that is not saved.
+    pub fn path(&self) -> &Path {
+        match &self.origin {
+            SceneOrigin::Trained(o) => &o.plan.output.out,
+            SceneOrigin::Loaded(s) => &s.path,
+        }
+    }
+    /// A copy of the scene, for work that changes it.
+    pub fn copied(&self) -> Scene {
+        match &self.origin {
+            SceneOrigin::Loaded(scene) => Scene::clone(scene),
+            SceneOrigin::Trained(outcome) => {
+                let mut scene = Scene::default();
+                scene.path = outcome.plan.output.out.clone();
+                scene.splats = outcome.splats.clone();
+                scene.seen = outcome.seen.clone();
+                scene.backdrop = outcome.backdrop.clone();
+                scene.cameras = outcome.cameras.clone();
+                scene.world = outcome.world.clone();
+                scene.language = self.language().cloned();
+                scene
+            }
+        }
+    }
     /// Place of a level's features in [`LiveScene::draw_bands`]; `None` without codes.
     pub fn features(&self, level: usize) -> Option<FeatureChannels> {
         self.viewer.features(level)
@@ -191,16 +220,12 @@ impl LiveScene {
         if let Some(row) = rows.iter().find(|row| **row >= count) {
             return Err(Error::input(format!("there is no splat {row}; the scene has {count}")));
         }
-        let path = match &self.origin {
-            SceneOrigin::Trained(outcome) => &outcome.plan.output.out,
-            SceneOrigin::Loaded(scene) => &scene.path,
-        };
-        if path.as_os_str().is_empty() {
+        if self.path().as_os_str().is_empty() {
             return Err(Error::input("save the scene before a part of it is taken"));
         }
         let pixels = &self.seen().pixels;
         let mut scene = Scene::default();
-        scene.path = path.clone();
+        scene.path = self.path().to_path_buf();
         scene.splats = self.splats().picked(rows);
         scene.seen.pixels = rows.iter().filter_map(|&i| pixels.get(i)).copied().collect();
         scene.cameras = self.cameras().to_vec();

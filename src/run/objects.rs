@@ -1,4 +1,8 @@
 //! A scene as a list of things with names, boxes and the view that shows each best.
+mod files;
+
+pub use files::{Listed, ObjectFiles, ObjectFolder, record, stems};
+
 use super::answer::placement_json;
 use super::ask::QueryScene;
 use super::encoder;
@@ -12,7 +16,7 @@ use crate::query::phrasing;
 use crate::query::presence::Presence;
 use crate::query::things::{self, Thing};
 use crate::scene::{Camera, LEVEL_NAMES, RgbImage, World};
-use crate::{Error, Result, gpu};
+use crate::{Error, Result};
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -135,6 +139,24 @@ pub fn thumbnail(picture: &RgbImage, view: &BestView) -> RgbImage {
 /// Smallest margin of a thumbnail, pixels.
 const SMALLEST_MARGIN: f64 = 6.0;
 
+/// Names of a vocabulary, one per line; `source` names it in messages.
+///
+/// # Errors
+/// No names, and one that is there twice.
+pub fn words(text: &str, source: &str) -> Result<Vec<String>> {
+    let mut words: Vec<String> = Vec::new();
+    for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
+        if words.iter().any(|word| word == line) {
+            return Err(Error::input(format!("{source}: \"{line}\" is there twice; leave one out")));
+        }
+        words.push(line.to_owned());
+    }
+    if words.is_empty() {
+        return Err(Error::input(format!("{source}: no words; give one name per line")));
+    }
+    Ok(words)
+}
+
 /// The things of a loaded scene, whose language moves onto the device.
 ///
 /// # Errors
@@ -159,9 +181,9 @@ pub fn of_scene(
     };
     scene.language.as_ref().ok_or_else(no_language)?;
     let encoder = encoder::of_scene(scene, machine.registry()?)?;
-    let gpu = gpu::open(machine.device.as_deref())?;
+    let device = machine.gpu()?;
     let field = scene.language.take().ok_or_else(no_language)?;
-    let mut ready = QueryScene::open(&gpu, (&scene.splats, &scene.cameras), field, encoder)?;
+    let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
     ready.set_views(&scene.cameras)?;
     let list = list(&mut ready, &scene.cameras, options, progress)?;
     Ok((ready, list))

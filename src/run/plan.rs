@@ -73,7 +73,7 @@ pub struct Extras {
 }
 
 /// Device, models and providers.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Machine {
     /// Vulkan device: `uuid:…`, `pci:…`, its number, or a part of its name.
@@ -83,6 +83,24 @@ pub struct Machine {
     /// Execution provider of the networks, one of [`crate::infer::provider::NAMES`]; `None` as in
     /// [`Compute::by`].
     pub provider: Option<String>,
+    /// Device and models that are open already, instead of those above.
+    #[serde(skip)]
+    pub opened: Option<Opened>,
+}
+
+/// A device and models of a program that holds them open.
+#[derive(Clone)]
+pub struct Opened {
+    /// The device.
+    pub device: Device,
+    /// The models.
+    pub registry: Registry,
+}
+
+impl std::fmt::Debug for Opened {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.debug_struct("Opened").field("device", &self.device.info().name).finish_non_exhaustive()
+    }
 }
 
 /// Place of the scene, and use of stages of an earlier run.
@@ -141,13 +159,30 @@ impl Inputs {
 }
 
 impl Machine {
-    /// The installed models.
-    pub fn registry(&self) -> Result<Registry> {
-        Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref()))
+    /// An open device with open models.
+    pub fn of(device: Device, registry: Registry) -> Machine {
+        Machine { opened: Some(Opened { device, registry }), ..Machine::default() }
     }
 
+    /// The installed models.
+    pub fn registry(&self) -> Result<Registry> {
+        match &self.opened {
+            Some(opened) => Ok(opened.registry.clone()),
+            None => Registry::with(self.models.as_deref(), Compute::by(self.provider.as_deref())),
+        }
+    }
+
+    /// The device.
+    pub fn gpu(&self) -> Result<Device> {
+        self.open(false)
+    }
+
+    /// The device; one that is open already is as deterministic as it was opened.
     pub(super) fn open(&self, deterministic: bool) -> Result<Device> {
-        gpu::open_with(&gpu::Options { deterministic, ..gpu::options(self.device.as_deref()) })
+        match &self.opened {
+            Some(opened) => Ok(opened.device.clone()),
+            None => gpu::open_with(&gpu::Options { deterministic, ..gpu::options(self.device.as_deref()) }),
+        }
     }
 }
 

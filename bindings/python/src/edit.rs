@@ -118,7 +118,7 @@ impl Editor {
         device: Option<String>,
         models: Option<PathBuf>,
     ) -> PyResult<Editor> {
-        let machine = Machine { device, models, provider: None };
+        let machine = Machine { device, models, ..Machine::default() };
         let editor = work::unobserved(py, || edit::Editor::open(&path, &machine))?;
         Ok(Editor { editor: Mutex::new(editor), machine, process: Process::current() })
     }

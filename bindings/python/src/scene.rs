@@ -433,7 +433,7 @@ pub fn objects(
     device: Option<String>,
     models: Option<PathBuf>,
 ) -> PyResult<String> {
-    let machine = Machine { device, models, provider: None };
+    let machine = Machine { device, models, ..Machine::default() };
     let least_share = min_share.unwrap_or(things::LEAST_SHARE);
     let options = ObjectOptions { vocabulary, least_share };
     work::unobserved(py, || {

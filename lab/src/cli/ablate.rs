@@ -6,12 +6,12 @@ use crate::ablate::{
 };
 use crate::{Error, Result};
 use serde_json::{Value, json};
-use splatvk::cli::outputs::WrittenFile;
 use splatvk::cli::print::{print, print_json};
 use splatvk::cli::progress;
 use splatvk::format::write_json;
 use splatvk::gpu;
 use splatvk::infer::Registry;
+use splatvk::run::outputs::WrittenFile;
 use splatvk_types::files;
 use splatvk_types::files::{Kind, Partial, check_place};
 use std::path::{Path, PathBuf};

@@ -4,11 +4,11 @@ use super::study::data_sets;
 use crate::Result;
 use crate::curve::{self, Curve, Plan, Point, Variant};
 use serde_json::json;
-use splatvk::cli::outputs::WrittenFile;
 use splatvk::cli::print::{print, print_json};
 use splatvk::cli::progress;
 use splatvk::format::write_json;
 use splatvk::gpu;
+use splatvk::run::outputs::WrittenFile;
 
 pub fn curve(args: &CurveArgs) -> Result<()> {
     let registry = args.device.registry()?;

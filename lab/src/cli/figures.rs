@@ -4,13 +4,13 @@ use super::study;
 use crate::ablate::Runner;
 use crate::figures::{self, Section};
 use crate::{Error, Result};
-use splatvk::cli::outputs::WrittenFiles;
 use splatvk::cli::print::print;
 use splatvk::cli::progress;
 use splatvk::format::picture;
 use splatvk::gpu;
 use splatvk::report::file_name;
 use splatvk::run::method::Method;
+use splatvk::run::outputs::WrittenFiles;
 
 /// The page of a data set.
 const PAGE: &str = "figures.html";

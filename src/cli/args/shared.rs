@@ -87,7 +87,7 @@ impl DeviceArgs {
     /// Device, models and provider of a run.
     pub fn machine(&self) -> Machine {
         let DeviceArgs { device, models, provider, .. } = self.clone();
-        Machine { device, models, provider }
+        Machine { device, models, provider, ..Machine::default() }
     }
 
     /// Installed models.

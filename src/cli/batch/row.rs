@@ -100,7 +100,7 @@ impl PlannedRow<'_> {
             if name.is_empty() || name.starts_with(['.', '-']) || name.contains(['/', '\\']) {
                 return Err(wrong("give a format, or a name with its ending"));
             }
-            let file = if name.contains('.') || export::is_folder(name) {
+            let file = if name.contains('.') || run::export::is_folder(name) {
                 name.clone()
             } else if name == "transforms" {
                 "transforms.json".to_owned()
@@ -121,7 +121,7 @@ impl PlannedRow<'_> {
                     wrong(e.to_string().lines().next().unwrap_or_default().trim_start_matches("error: "))
                 })?
                 .args;
-            export::format(&args)?;
+            args.check()?;
             Ok(args)
         });
         parsed.collect()

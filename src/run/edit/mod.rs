@@ -20,7 +20,7 @@ use crate::query::clicks::Standing;
 use crate::query::instances::Places;
 use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, Image, LanguageField};
-use crate::{Error, Result, gpu};
+use crate::{Error, Result};
 use rayon::prelude::*;
 pub use select::Histogram;
 use std::path::Path;
@@ -294,7 +294,7 @@ impl Editor {
                 Some(encoder) => encoder,
                 None => encoder::of_scene(scene, self.machine.registry()?)?,
             };
-            let device = gpu::open(self.machine.device.as_deref())?;
+            let device = self.machine.gpu()?;
             let ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
             self.lookup.words = Some(ready);
         }
@@ -306,7 +306,7 @@ impl Editor {
         let scene = &self.scene;
         let row = |i: usize| scene.edits.as_ref().map_or(i, |edits| edits.rows[i] as usize);
         let kept: Vec<usize> = (0..scene.splats.len()).filter(|i| !deleted.has(row(*i))).collect();
-        let device = gpu::open(self.machine.device.as_deref())?;
+        let device = self.machine.gpu()?;
         let bare = scene.splats.bare();
         let before = view::seen(&device, &bare, &scene.cameras, &Silent)?.pixels;
         let after = view::seen(&device, &bare.picked(&kept), &scene.cameras, &Silent)?.pixels;
@@ -320,7 +320,7 @@ impl Editor {
             return Ok(depth.clone());
         }
         if self.lookup.surface.is_none() {
-            let device = gpu::open(self.machine.device.as_deref())?;
+            let device = self.machine.gpu()?;
             self.lookup.surface = Some(Renderer::new(&device, &self.scene.splats.bare(), &[], 0)?);
         }
         let renderer = self.lookup.surface.as_mut().ok_or_else(|| Error::work("no renderer"))?;

@@ -6,26 +6,46 @@ mod space;
 mod synthesize;
 mod views;
 
+use super::config::{GeometryConfig, LanguageConfig, ReconstructionConfig, TrainingConfig};
 use super::execute::{Reconstruction, Start, store, write};
 use super::outcome::RunOutcome;
 use super::plan::RunPlan;
 use super::remaining::WithRemaining;
-use super::sources;
+use super::sources::{self, SourceChoice};
 use super::stages::GivenViews;
 use crate::format::scene_dir::{self, Scene};
 use crate::format::{Workspace, edits};
 use crate::pass::renderer::{RenderedFrame, Renderer};
 use crate::photo::{self, Photo};
+use crate::pipeline::Store;
 use crate::pose::Geometry;
 use crate::progress::{Progress, Recorded};
 use crate::scene::{Camera, DepthMap, PointCloud, World};
 use crate::{Error, Result, files};
 use glam::DVec2;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use views::{ViewSource, Views};
 
+/// Configuration of a run that gives splats language; `cameras` is a file of cameras in their
+/// coordinates.
+pub fn config(
+    cameras: Option<PathBuf>,
+    max_size: Option<usize>,
+    language: LanguageConfig,
+) -> ReconstructionConfig {
+    let init = cameras.map(|file| SourceChoice::with("cameras", file));
+    ReconstructionConfig {
+        geometry: GeometryConfig {
+            init: init.unwrap_or_else(|| SourceChoice::named("sfm")),
+            depth_prior: SourceChoice::named("none"),
+        },
+        training: TrainingConfig { max_size, ..TrainingConfig::default() },
+        language: Some(language),
+    }
+}
+
 /// Gives the splats of `plan.inputs.splats` language and writes a scene directory, whole or not at
-/// all.
+/// all; a plan without a place for it keeps the scene in memory.
 pub(super) fn run(plan: &RunPlan, path: &Path, progress: &dyn Progress) -> Result<RunOutcome> {
     let remaining = WithRemaining::new(progress);
     let progress = &Recorded::new(&remaining);
@@ -41,7 +61,11 @@ pub(super) fn run(plan: &RunPlan, path: &Path, progress: &dyn Progress) -> Resul
     }
     let source = ViewSource::of(plan, &scene)?;
     let read: Vec<&Path> = plan.read().collect();
-    let workspace = Workspace::create(&plan.output.out, plan.output.force, &read)?;
+    let output = &plan.output;
+    let workspace = match output.out.as_os_str().is_empty() {
+        true => None,
+        false => Some(Workspace::create(&output.out, output.force, &read)?),
+    };
     let device = plan.machine.open(plan.config.training.deterministic)?;
     let max_size = plan.config.training.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let mut renderer = Renderer::new(&device, &scene.splats, &[], 0)?;
@@ -67,10 +91,15 @@ pub(super) fn run(plan: &RunPlan, path: &Path, progress: &dyn Progress) -> Resul
         remaining: &remaining,
         preview: None,
     };
-    let store = store(plan.output.resume, plan.output.checkpoint_seconds)?;
+    let store = match workspace {
+        Some(_) => store(output.resume, output.checkpoint_seconds)?,
+        None => Store::none(),
+    };
     let made = reconstruction.run(&device, &registry, Vec::new(), &store, progress)?;
     let outcome = finished(made, scene, plan);
-    write(workspace, &outcome, progress)?;
+    if let Some(workspace) = workspace {
+        write(workspace, &outcome, progress)?;
+    }
     Ok(outcome)
 }
 

@@ -1,4 +1,5 @@
 //! Triangle mesh of a scene: rendered depth, fused (docs/use/mesh.md).
+mod file;
 mod frames;
 mod place;
 #[cfg(test)]
@@ -12,6 +13,7 @@ use crate::scene::{Camera, Mesh};
 use crate::{Error, Result};
 use splatvk_mesh::{Collider, Frame, Simplify, Tsdf, TsdfOptions, border_edges, build};
 
+pub use file::{MeshOutput, MeshPlan, TRIANGLES};
 pub use place::{Placement, placed};
 pub use things::Things;
 

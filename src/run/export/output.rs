@@ -1,8 +1,7 @@
-//! Reserved output of `splatvk export`, and its format.
-use super::ExportArgs;
-use crate::cli::outputs::{WrittenFile, WrittenFiles, check_file};
+//! Reserved output of an export, and its format.
 use crate::files::{Kind, check_place};
 use crate::format::gaussians::{FORMATS, Reserved, SplatFormat};
+use crate::run::outputs::{WrittenFile, WrittenFiles, check_file};
 use crate::{Error, Result};
 use std::path::Path;
 
@@ -18,16 +17,12 @@ pub(super) enum Output {
 
 impl Output {
     /// Reserves the output, or refuses a place that may not be written, before the scene is read.
-    pub(super) fn reserve(args: &ExportArgs, format: &str) -> Result<Output> {
+    pub(super) fn reserve(scene: &Path, out: &Path, format: &str, force: bool) -> Result<Output> {
         let is_folder = is_folder(format);
-        if args.spz_version.is_some() && format != "spz" {
-            return Err(Error::input("--spz-version: only --format spz has versions; leave it out"));
-        }
-        let out = args.place();
         check_ending(out, format)?;
         // Refuses a link wherever it leads.
         check_place(out, if is_folder { Kind::Folder } else { Kind::File }, true)?;
-        if let (Ok(place), Ok(scene)) = (out.canonicalize(), args.scene.canonicalize())
+        if let (Ok(place), Ok(scene)) = (out.canonicalize(), scene.canonicalize())
             && scene.is_dir()
             && place.starts_with(&scene)
         {
@@ -36,16 +31,16 @@ impl Output {
                 out.display()
             )));
         }
-        let inputs = [args.scene.as_path()];
+        let inputs = [scene];
         if is_folder {
-            return WrittenFiles::open(out, args.force, &inputs).map(Output::Folder);
+            return WrittenFiles::open(out, force, &inputs).map(Output::Folder);
         }
         match SplatFormat::named(format).filter(|format| format.name != "ply") {
             Some(format) => {
-                check_file(out, args.force, &inputs)?;
-                Ok(Output::Splats(Reserved::open(out, args.force)?, format))
+                check_file(out, force, &inputs)?;
+                Ok(Output::Splats(Reserved::open(out, force)?, format))
             }
-            None => WrittenFile::open(out, args.force, &inputs).map(Output::File),
+            None => WrittenFile::open(out, force, &inputs).map(Output::File),
         }
     }
 }
@@ -55,17 +50,38 @@ fn endings() -> impl Iterator<Item = (&'static str, &'static str)> {
     FORMATS.iter().map(|f| (f.name, f.ending)).chain([("transforms", ".json"), ("html", ".html")])
 }
 
+/// Formats beside those of Gaussians, with a description.
+const OTHERS: [(&str, &str); 4] = [
+    ("html", "the interactive view as one page, to look at and to send"),
+    ("colmap", "COLMAP text model"),
+    ("colmap-bin", "COLMAP binary model"),
+    ("transforms", "nerfstudio transforms.json"),
+];
+
+/// All formats with a description.
+pub fn formats() -> impl Iterator<Item = (&'static str, &'static str)> {
+    FORMATS.iter().map(|f| (f.name, f.about)).chain(OTHERS)
+}
+
 /// Whether a format is a folder of files.
 pub fn is_folder(format: &str) -> bool {
     format.starts_with("colmap")
 }
 
 /// The requested format, or that of the ending of the file's name.
-pub fn format(args: &ExportArgs) -> Result<&str> {
-    if let Some(format) = &args.format {
-        return Ok(format);
+///
+/// # Errors
+/// An unknown format, and a name that states none.
+pub fn format<'a>(asked: Option<&'a str>, out: &Path) -> Result<&'a str> {
+    if let Some(format) = asked {
+        return match formats().any(|(name, _)| name == format) {
+            true => Ok(format),
+            false => Err(Error::input(format!(
+                "--format: there is no format {format}; there are {}",
+                formats().map(|(name, _)| name).collect::<Vec<_>>().join(", ")
+            ))),
+        };
     }
-    let out = args.place();
     let lower = out.to_string_lossy().to_lowercase();
     match endings().find(|(_, ending)| lower.ends_with(ending)) {
         Some((name, _)) => Ok(name),

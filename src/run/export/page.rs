@@ -1,17 +1,17 @@
 //! `--format html`: the interactive view of a scene as one file.
-use super::{ExportArgs, Exported};
-use crate::cli::outputs::WrittenFile;
-use crate::cli::scene;
+use super::{Asked, ExportPlan, Exported};
 use crate::format::scene_dir::Scene;
 use crate::format::views::Views;
 use crate::report::thousands;
 use crate::report::viewer::{CodeNames, Scene3d};
+use crate::run::outputs::WrittenFile;
+use crate::run::stored;
 use crate::{Error, Result};
 use serde_json::json;
 
 /// Refuses options that a page has no use for.
-pub(super) fn check(args: &ExportArgs) -> Result<()> {
-    if args.up.is_some() || args.metres || args.raw {
+pub(super) fn check(plan: &ExportPlan) -> Result<()> {
+    if plan.asked != Asked::default() {
         return Err(Error::input(
             "--format html: a page opens upright and keeps the scene's coordinates; leave --up, --metres and --raw out",
         ));
@@ -21,16 +21,16 @@ pub(super) fn check(args: &ExportArgs) -> Result<()> {
 
 /// Writes the page. It shows all splats of the scene that fit, and hides at a key those that no
 /// photo shows.
-pub(super) fn write(args: &ExportArgs, scene: &Scene, file: WrittenFile) -> Result<Exported> {
+pub(super) fn write(plan: &ExportPlan, scene: &Scene, file: WrittenFile) -> Result<Exported> {
     if scene.splats.is_empty() {
-        return Err(Error::input(format!("{}: no splats to show", args.scene.display())));
+        return Err(Error::input(format!("{}: no splats to show", scene.path.display())));
     }
-    let images = scene::photos(scene);
-    let title = args.title.clone().unwrap_or_else(|| scene::title(&args.scene));
+    let images = stored::photos(scene);
+    let title = plan.title.clone().unwrap_or_else(|| stored::title(&scene.path));
     let names = CodeNames::new();
-    let named = match &args.views {
+    let named = match &plan.views {
         Some(file) => Views::read(file)?,
-        None => Views::of_scene(&args.scene)?,
+        None => Views::of_scene(&scene.path)?,
     };
     let view = Scene3d { named, ..Scene3d::of(scene, &title, &images, &names) };
     let page = view.presented()?;

@@ -8,7 +8,10 @@ use glam::{DMat3, DVec3, Vec3};
 use serde_json::{Value, json};
 
 /// Value of `--up`.
-pub(super) fn up_axis(text: &str) -> Result<UpAxis, String> {
+///
+/// # Errors
+/// Another text than -y, y or z.
+pub fn up_axis(text: &str) -> Result<UpAxis, String> {
     match text {
         "-y" => Ok(UpAxis::MinusY),
         "y" => Ok(UpAxis::PlusY),
@@ -29,7 +32,7 @@ enum Kept {
 }
 
 /// Placement that the user asks for.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Asked {
     /// `--up`
     pub up: Option<UpAxis>,
