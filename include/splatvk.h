@@ -4,8 +4,8 @@
  * Generated from src/capi by cbindgen; do not edit.
  *
  * Rules for all functions
- * - Handles (SvkContext, SvkScene) are opaque. Each is created by one function and destroyed by its
- *   _destroy function. A context may be destroyed before its scenes.
+ * - Handles (SvkContext, SvkScene, SvkEditor) are opaque. Each is created by one function and
+ *   destroyed by its _destroy function. A context may be destroyed before its scenes and editors.
  * - Functions return an SvkStatus. After any other status than SVK_STATUS_OK the handle keeps an
  *   error text of one line: the error, its place, and the remedy. For a handle that is NULL there
  *   is no text, only SVK_STATUS_ARGUMENT.
@@ -37,11 +37,11 @@
  Version of this interface: major × 65536 + minor. A program works with any library of the same
  major version and the same or a higher minor version.
  */
-#define SVK_ABI_VERSION 65536
+#define SVK_ABI_VERSION 65537
 
 /*
- Result of a function. After any other status than SVK_STATUS_OK, svk_context_error or
- svk_scene_error returns a text.
+ Result of a function. After any other status than SVK_STATUS_OK, svk_context_error,
+ svk_scene_error or svk_editor_error returns a text.
  */
 enum SvkStatus
 #if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
@@ -108,6 +108,11 @@ enum SvkStatus
      remains.
      */
     SVK_STATUS_UNWRITABLE = 13,
+    /*
+     An edit was not made, because its selection may be wrong: nothing is changed.
+     svk_editor_doubts returns the reasons, and SvkEdit.force edits anyway.
+     */
+    SVK_STATUS_DOUBTFUL = 14,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -374,9 +379,142 @@ typedef uint32_t SvkArray;
 #endif // __cplusplus
 
 /*
+ Shapes for physics beside every part of a mesh.
+ */
+enum SvkCollider
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /*
+     None.
+     */
+    SVK_COLLIDER_NONE = 0,
+    /*
+     The convex hull.
+     */
+    SVK_COLLIDER_HULL = 1,
+    /*
+     Convex pieces that follow the shape (V-HACD).
+     */
+    SVK_COLLIDER_DECOMPOSITION = 2,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum SvkCollider SvkCollider;
+#else
+typedef uint32_t SvkCollider;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/*
+ Axis that points up in an exported file.
+ */
+enum SvkUpAxis
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /*
+     y in .spz, .glb and .gltf, else -y, where the scene states the direction up.
+     */
+    SVK_UP_AXIS_AUTO = 0,
+    /*
+     -y: right, down, forward, as in cameras.
+     */
+    SVK_UP_AXIS_MINUS_Y = 1,
+    /*
+     y: right, up, back.
+     */
+    SVK_UP_AXIS_Y = 2,
+    /*
+     z: right, forward, up.
+     */
+    SVK_UP_AXIS_Z = 3,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum SvkUpAxis SvkUpAxis;
+#else
+typedef uint32_t SvkUpAxis;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/*
+ Level of the files of svk_scene_objects.
+ */
+enum SvkPieces
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /*
+     Things as a whole.
+     */
+    SVK_PIECES_THINGS = 0,
+    /*
+     Their parts.
+     */
+    SVK_PIECES_PARTS = 1,
+    /*
+     Parts of parts.
+     */
+    SVK_PIECES_SUBPARTS = 2,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum SvkPieces SvkPieces;
+#else
+typedef uint32_t SvkPieces;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/*
+ Operation of an edit.
+ */
+enum SvkOperation
+#if defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+  : uint32_t
+#endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
+ {
+    /*
+     Removes the selected splats.
+     */
+    SVK_OPERATION_DELETE = 0,
+    /*
+     Removes all other splats.
+     */
+    SVK_OPERATION_ISOLATE = 1,
+    /*
+     Gives the selected splats a mean colour; each keeps its brightness against the mean.
+     */
+    SVK_OPERATION_RECOLOUR = 2,
+    /*
+     Moves the selected splats.
+     */
+    SVK_OPERATION_MOVE = 3,
+    /*
+     Removes splats in free space, in front of the surfaces that photos show.
+     */
+    SVK_OPERATION_FLOATERS = 4,
+};
+#ifndef __cplusplus
+#if __STDC_VERSION__ >= 202311L
+typedef enum SvkOperation SvkOperation;
+#else
+typedef uint32_t SvkOperation;
+#endif // __STDC_VERSION__ >= 202311L
+#endif // __cplusplus
+
+/*
  A Vulkan device and a folder of models.
  */
 typedef struct SvkContext SvkContext;
+
+/*
+ A scene directory that is being edited.
+ */
+typedef struct SvkEditor SvkEditor;
 
 /*
  A trained or loaded scene.
@@ -619,9 +757,9 @@ typedef struct {
 } SvkProgress;
 
 /*
- Progress callback. It is called from any thread, but never from two at a time, and not after
- svk_train returns. A result other than 0 stops the training. It must not throw an exception or
- call functions with the context that trains.
+ Progress callback. It is called from any thread, but never from two at a time, and not after the
+ function returns that it was given to. A result other than 0 stops the work. It must not throw
+ an exception or call functions with the context or the scene that works.
  */
 typedef int32_t (*SvkProgressFunction)(void *user, const SvkProgress *progress);
 
@@ -729,6 +867,11 @@ typedef struct {
      Things that are ignored in all photos, as by --ignore, one a line. NULL = none.
      */
     const char *ignore;
+    /*
+     Folder of a mask per photo, as of --photo-masks: x.png or x.jpg.png for x.jpg, black is not
+     used. All photos must be files. NULL = masks beside the photos, if there are any.
+     */
+    const char *photo_masks;
 } SvkTrainOptions;
 
 /*
@@ -959,6 +1102,363 @@ typedef struct {
     uint64_t signal_value;
 } SvkSync;
 
+/*
+ Options of svk_label. Zero is the default of every field but `size`: photos of a scene directory,
+ or else 24 views that are rendered from the splats.
+ */
+typedef struct {
+    /*
+     sizeof(SvkLabelOptions)
+     */
+    size_t size;
+    /*
+     Folder of the photos of the training; needs `cameras`. NULL = none.
+     */
+    const char *images;
+    /*
+     Cameras in the coordinates of the splats: transforms.json, a COLMAP model folder or
+     cameras.json; without `images` the splats are rendered from them. NULL = none.
+     */
+    const char *cameras;
+    /*
+     Folder of a mask per photo of `images`, as of --photo-masks; NULL = masks beside the photos,
+     if there are any.
+     */
+    const char *photo_masks;
+    /*
+     Number of photos or cameras that are used; needs `cameras`. 0 = 16 photos, or 24 cameras.
+     */
+    uint32_t views;
+    /*
+     Number of views that are rendered from cameras in free space, at most 200; not with
+     `cameras`. 0 = 24 where there are neither photos nor cameras.
+     */
+    uint32_t synthesize;
+    /*
+     Longer side of the working images, pixels. 0 = 800 on a CPU device, 1600 on a GPU.
+     */
+    uint64_t max_size;
+    /*
+     Source of masks, as of --masks. NULL = built-in.
+     */
+    const char *mask_source;
+    /*
+     Source of region features, as of --features. NULL = built-in.
+     */
+    const char *feature_source;
+    /*
+     Points along each side of a picture at which a mask network is asked, at most 128; 0 = 32.
+     */
+    uint32_t mask_points;
+    /*
+     1 = do not ask the mask network about four overlapping crops as well.
+     */
+    uint32_t no_mask_crops;
+    /*
+     Scene directory to write, whole or not at all; NULL = the scene stays in memory.
+     */
+    const char *out;
+    /*
+     1 = replace a scene directory at `out`.
+     */
+    uint64_t replace;
+    /*
+     Progress callback; may be NULL.
+     */
+    SvkProgressFunction progress;
+    /*
+     First argument of `progress`.
+     */
+    void *user;
+} SvkLabelOptions;
+
+/*
+ Options of svk_scene_export. Zero is the default of every field but `size`: upright and in
+ metres, as far as the scene states them, without what no photo shows.
+ */
+typedef struct {
+    /*
+     sizeof(SvkExportOptions)
+     */
+    size_t size;
+    /*
+     Name of the format, as of --format; NULL = by the ending of the path.
+     */
+    const char *format;
+    /*
+     html: heading of the page; NULL = the name of the scene.
+     */
+    const char *title;
+    /*
+     html: file of named views; NULL = views.json of the scene.
+     */
+    const char *views;
+    /*
+     SvkUpAxis. An axis is SVK_STATUS_INPUT where the direction up is not known.
+     */
+    uint32_t up;
+    /*
+     1 = a scene whose metres are not known is SVK_STATUS_INPUT.
+     */
+    uint32_t metres;
+    /*
+     1 = keep the axes and the unit of the scene, except for those that `up` and `metres` name.
+     */
+    uint32_t raw;
+    /*
+     1 = keep what no photo shows: surfaces continued beyond the photos, colours behind the
+     scene.
+     */
+    uint32_t guessed;
+    /*
+     ply: 1 = language features and codes as extra columns.
+     */
+    uint32_t with_features;
+    /*
+     ply: SvkShDegree of the file, padded with zeros; SVK_SH_DEGREE_AUTO = 3.
+     */
+    uint32_t ply_degree;
+    /*
+     spz: version of the file, 2 to 4; 0 = 3.
+     */
+    uint32_t spz_version;
+    /*
+     1 = replace an ordinary file, or files of the same names in a folder.
+     */
+    uint32_t replace;
+    /*
+     Progress callback; may be NULL.
+     */
+    SvkProgressFunction progress;
+    /*
+     First argument of `progress`.
+     */
+    void *user;
+} SvkExportOptions;
+
+/*
+ Options of svk_scene_mesh. Zero is the default of every field but `size`: upright, in metres and
+ on the ground, as far as the scene states them. A length is "2mm", "0.5cm" or "0.01m" where the
+ scale of the scene is known, or a number in its units.
+ */
+typedef struct {
+    /*
+     sizeof(SvkMeshOptions)
+     */
+    size_t size;
+    /*
+     Most triangles; 0 = 100,000.
+     */
+    uint64_t triangles;
+    /*
+     Instead of `triangles`: length by which 99.9 % of the surface may move. NULL = `triangles`.
+     */
+    const char *error;
+    /*
+     Side of a voxel; NULL = two pixels of the photos at their surfaces.
+     */
+    const char *voxel;
+    /*
+     Cameras to look from: transforms.json, a COLMAP model folder or cameras.json; a file of
+     Gaussians needs them. NULL = those of the scene.
+     */
+    const char *cameras;
+    /*
+     Names of things to choose from, one a line; needs `by_object`. NULL = those of the text
+     model.
+     */
+    const char *vocabulary;
+    /*
+     SvkCollider; not for .ply.
+     */
+    uint32_t collider;
+    /*
+     1 = a part with a name for every thing of the scene, which must have language.
+     */
+    uint32_t by_object;
+    /*
+     1 = also surfaces that no photo shows; otherwise they are holes.
+     */
+    uint32_t fill_guessed;
+    /*
+     1 = keep the axes, the unit and the origin of the scene.
+     */
+    uint32_t raw;
+    /*
+     1 = replace an ordinary file.
+     */
+    uint64_t replace;
+    /*
+     Progress callback; may be NULL.
+     */
+    SvkProgressFunction progress;
+    /*
+     First argument of `progress`.
+     */
+    void *user;
+} SvkMeshOptions;
+
+/*
+ Figures of a mesh. Lengths are in the unit of the file.
+ */
+typedef struct {
+    /*
+     sizeof(SvkMeshInfo)
+     */
+    size_t size;
+    /*
+     Number of triangles.
+     */
+    uint64_t triangles;
+    /*
+     Number of vertices.
+     */
+    uint64_t vertices;
+    /*
+     Number of parts.
+     */
+    uint64_t parts;
+    /*
+     Number of edges at holes and borders.
+     */
+    uint64_t border_edges;
+    /*
+     1 = y points up against gravity.
+     */
+    uint32_t upright;
+    /*
+     1 = the unit is a metre; 0 = that of the scene.
+     */
+    uint32_t metric;
+    /*
+     Area of the surface, square units.
+     */
+    double area;
+    /*
+     Side of a voxel.
+     */
+    double voxel;
+    /*
+     Length by which the simplification moved 99.9 % of the surface at most.
+     */
+    double moved;
+} SvkMeshInfo;
+
+/*
+ Options of svk_scene_objects. Zero is the default of every field but `size`.
+ */
+typedef struct {
+    /*
+     sizeof(SvkObjectsOptions)
+     */
+    size_t size;
+    /*
+     Names to choose from, one a line; NULL = those of the text model.
+     */
+    const char *vocabulary;
+    /*
+     Smallest share of the opacity of the scene that is a thing, up to 1; 0 = 0.001.
+     */
+    double min_share;
+    /*
+     Format of the file of each thing, as of --format; NULL = "ply".
+     */
+    const char *format;
+    /*
+     SvkPieces: level of the files; objects.json lists all three.
+     */
+    uint32_t pieces;
+    /*
+     1 = files keep the axes and the unit of the scene; otherwise they are upright and in metres,
+     as far as the scene states them.
+     */
+    uint32_t raw;
+    /*
+     1 = replace ordinary files of the same names in the folder.
+     */
+    uint64_t replace;
+    /*
+     Progress callback; may be NULL.
+     */
+    SvkProgressFunction progress;
+    /*
+     First argument of `progress`.
+     */
+    void *user;
+} SvkObjectsOptions;
+
+/*
+ An edit of a scene directory. Zero is the default of every field but `size`.
+ */
+typedef struct {
+    /*
+     sizeof(SvkEdit)
+     */
+    size_t size;
+    /*
+     SvkOperation
+     */
+    uint32_t operation;
+    /*
+     1 = also edit where the selection is doubtful.
+     */
+    uint32_t force;
+    /*
+     1 = only select: nothing is changed, whether it is doubtful or not.
+     */
+    uint32_t dry_run;
+    /*
+     SVK_OPERATION_FLOATERS: 1 = also splats on the surface of one photo that more photos look
+     through.
+     */
+    uint32_t thorough;
+    /*
+     Selection as of `splatvk edit`: words, ids of things ("id:l3"), ranges ("opacity<0.1",
+     "size>5cm", "reliability<0.3", "seen<1"), joined with " + ", " - " or " & ". NULL with
+     SVK_OPERATION_FLOATERS.
+     */
+    const char *selection;
+    /*
+     Words select more (above 0) or less (below 0), -1 to 1.
+     */
+    double grow;
+    /*
+     SVK_OPERATION_RECOLOUR: sRGB colour, "#rrggbb" or "#rgb".
+     */
+    const char *colour;
+    /*
+     SVK_OPERATION_MOVE: displacement along the axes of the scene, scene units.
+     */
+    double displacement[3];
+    /*
+     SVK_OPERATION_MOVE: a text instead of `displacement`, "0,-5cm,0", "up 5cm" or "down 5cm".
+     NULL = `displacement`.
+     */
+    const char *by;
+} SvkEdit;
+
+/*
+ Outcome of an edit.
+ */
+typedef struct {
+    /*
+     sizeof(SvkEdited)
+     */
+    size_t size;
+    /*
+     Number of selected splats.
+     */
+    uint64_t splats;
+    /*
+     Their share of the opacity of the scene, 0 to 1.
+     */
+    double share;
+    /*
+     Number of reasons why the selection may be wrong; svk_editor_doubts returns them.
+     */
+    uint64_t doubts;
+} SvkEdited;
+
 #ifdef __cplusplus
 extern "C" {
 #endif // __cplusplus
@@ -1118,6 +1618,112 @@ SvkStatus svk_scene_render(SvkScene *scene,
  Thread-safe.
  */
 SvkStatus svk_scene_wait(SvkScene *scene);
+
+/*
+ Gives the splats of a file of Gaussians of any trainer, or of a scene directory, language; no
+ number of a splat changes. `options` may be NULL. On failure, and when the callback stops it,
+ `*scene` is NULL, nothing is written, and the context keeps the error text. Thread-safe.
+ */
+SvkStatus svk_label(SvkContext *context, const char *path, const SvkLabelOptions *options, SvkScene **scene);
+
+/*
+ Writes the scene as `splatvk export`: the format follows the ending of `path`; axes and unit
+ follow the direction up and the scale of the scene. `options` may be NULL. One line on what was
+ done is copied into `summary`, which has `summary_bytes` bytes and may be NULL. The output
+ appears complete or not at all. Formats of cameras and pages need a scene that is stored.
+
+ The call works on a copy of the scene: other calls go on meanwhile. Thread-safe.
+ */
+SvkStatus svk_scene_export(SvkScene *scene,
+                           const char *path,
+                           const SvkExportOptions *options,
+                           char *summary,
+                           size_t summary_bytes);
+
+/*
+ Writes the surfaces of the scene as triangles, as `splatvk mesh`, into a .glb, .ply or .obj.
+ `options` may be NULL. `info` receives the figures and may be NULL. The file appears complete or
+ not at all. Parts by object need a scene that is stored.
+
+ The call works on a copy of the scene: other calls go on meanwhile. Thread-safe.
+ */
+SvkStatus svk_scene_mesh(SvkScene *scene, const char *path, const SvkMeshOptions *options, SvkMeshInfo *info);
+
+/*
+ Writes the things of a stored scene with language into a folder, as `splatvk objects --out`:
+ objects.json, objects.csv, a file of Gaussians and a picture per thing, scene.glb with a named
+ node per thing, and scene.ply with the property `object`. `options` may be NULL. `*count`, which
+ may be NULL, receives the number of things, parts and subparts in objects.json. The files appear
+ complete or not at all.
+
+ The call works on a copy of the scene: other calls go on meanwhile. Thread-safe.
+ */
+SvkStatus svk_scene_objects(SvkScene *scene, const char *folder, const SvkObjectsOptions *options, size_t *count);
+
+/*
+ Opens a scene directory for edits; on failure `*editor` is NULL and the context keeps the error
+ text. Edits are kept in edits.json of the scene; its other files stay as they are, and scenes
+ that are loaded later contain the edits. Thread-safe.
+ */
+SvkStatus svk_editor_open(SvkContext *context, const char *path, SvkEditor **editor);
+
+/*
+ Destroys an editor; the edits stay in the scene. NULL is allowed. No other call with this editor
+ may be running.
+ */
+void svk_editor_destroy(SvkEditor *editor);
+
+/*
+ Copies the error text of the last failed call with this editor, in any thread, into `text` as
+ svk_context_device_name does; returns the number of bytes that the whole text needs.
+ Thread-safe.
+ */
+size_t svk_editor_error(const SvkEditor *editor, char *text, size_t bytes);
+
+/*
+ Selects splats of the edited scene, makes one edit of them and writes edits.json, whole or not
+ at all; fills `edited`, which may be NULL.
+
+ A selection that may be wrong, and that `force` does not allow, is SVK_STATUS_DOUBTFUL: nothing
+ is changed, `edited` is filled, and svk_editor_doubts returns the reasons. A word that the scene
+ does not contain, a selection of nothing and an edit that leaves no splat are SVK_STATUS_INPUT.
+ Thread-safe; calls with one editor are serialised. A list that another program changed
+ meanwhile is refused.
+ */
+SvkStatus svk_editor_edit(SvkEditor *editor, const SvkEdit *edit, SvkEdited *edited);
+
+/*
+ Copies the reasons why the selection of the last svk_editor_edit may be wrong into `text`, which
+ has `bytes` bytes: one line each, truncated where they do not fit and always ended with a zero
+ byte; empty where it is sure. Returns the number of bytes that the whole text needs.
+ Thread-safe.
+ */
+size_t svk_editor_doubts(const SvkEditor *editor, char *text, size_t bytes);
+
+/*
+ Undoes the last `most` edits. `*undone`, which may be NULL, receives how many there were: 0 is no
+ failure. Thread-safe; calls with one editor are serialised.
+ */
+SvkStatus svk_editor_undo(SvkEditor *editor, size_t most, size_t *undone);
+
+/*
+ Applies the `most` edits that were undone last; a new edit ends what can be redone. `*redone`,
+ which may be NULL, receives how many there were: 0 is no failure. Thread-safe; calls with one
+ editor are serialised.
+ */
+SvkStatus svk_editor_redo(SvkEditor *editor, size_t most, size_t *redone);
+
+/*
+ Fills `edits` with the number of edits of the scene, and `undone` with the number of those that
+ can be redone; both may be NULL. Thread-safe.
+ */
+SvkStatus svk_editor_count(const SvkEditor *editor, size_t *edits, size_t *undone);
+
+/*
+ Makes a scene of the present state; later edits do not change it. On failure `*scene` is NULL
+ and the editor keeps the error text. Thread-safe.
+ */
+SvkStatus svk_editor_scene(SvkEditor *editor, SvkScene **scene);
 
 #ifdef __cplusplus
 }  // extern "C"

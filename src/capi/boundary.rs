@@ -1,4 +1,5 @@
 //! Conversions between C and Rust: panics, errors, pointers, texts and versioned structures.
+use super::options::*;
 use super::types::*;
 use crate::files::panic_text;
 use crate::sync::lock;
@@ -20,6 +21,8 @@ pub enum CallError {
     Error(Error),
     /// Wrong use of the interface by the calling program.
     Argument(String),
+    /// An edit of a doubtful selection.
+    Doubtful(String),
 }
 
 impl From<crate::gpu::Error> for CallError {
@@ -44,7 +47,8 @@ pub fn bad_argument<T>(what: impl Into<String>) -> Result<T, CallError> {
 pub struct LastError(Mutex<String>);
 
 impl LastError {
-    fn set(&self, text: String) {
+    /// Keeps a text.
+    pub fn set(&self, text: String) {
         *lock(&self.0) = text;
     }
     /// Copies the text as a C string: see [`copy_text`].
@@ -87,6 +91,7 @@ fn caught(store: impl FnOnce(String), body: impl FnOnce() -> Result<(), CallErro
         Ok(Ok(())) => return SvkStatus::Ok,
         Ok(Err(CallError::Error(e))) => (status(&e), e.to_string()),
         Ok(Err(CallError::Argument(text))) => (SvkStatus::Argument, text),
+        Ok(Err(CallError::Doubtful(text))) => (SvkStatus::Doubtful, text),
         Err(panic) => (SvkStatus::Internal, format!("internal error: {}", panic_text(panic.as_ref()))),
     };
     store(text);
@@ -145,7 +150,14 @@ versioned!(
     SvkOutput 80,
     SvkSync 40,
     SvkAnswer 48,
-    SvkInstance 224
+    SvkInstance 224,
+    SvkLabelOptions 104,
+    SvkExportOptions 80,
+    SvkMeshOptions 88,
+    SvkMeshInfo 72,
+    SvkObjectsOptions 64,
+    SvkEdit 80,
+    SvkEdited 32
 );
 
 /// Size that a structure states, bytes.

@@ -5,17 +5,25 @@ use crate::gpu::vk::{self, Handle};
 use crate::gpu::{self, Device, EnabledFeatures, HostDevice, Options, QueueLock};
 use crate::infer::provider::NAMES;
 use crate::infer::{Compute, Registry};
+use crate::run::Machine;
 use std::ffi::{CStr, c_char, c_void};
 
 /// Version of this interface: major × 65536 + minor. A program works with any library of the same
 /// major version and the same or a higher minor version.
-pub const SVK_ABI_VERSION: u32 = 0x1_0000;
+pub const SVK_ABI_VERSION: u32 = 0x1_0001;
 
 /// A Vulkan device and a folder of models.
 pub struct SvkContext {
     pub(super) device: Device,
     pub(super) registry: Registry,
     pub(super) error: LastError,
+}
+
+impl SvkContext {
+    /// The device and the models, for runs.
+    pub(super) fn machine(&self) -> Machine {
+        Machine::of(self.device.clone(), self.registry.clone())
+    }
 }
 
 /// Returns the SVK_ABI_VERSION of the library. Thread-safe.

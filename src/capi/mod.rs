@@ -1,5 +1,5 @@
 //! The C ABI. cbindgen generates `include/splatvk.h` from this folder; the work is done in
-//! [`crate::run::live`].
+//! [`crate::run`].
 //!
 //! The header's introduction (`cbindgen.toml`) holds the rules of all functions. Structures begin
 //! with their size, so that hosts built against an older header keep working. Fields are only added
@@ -9,6 +9,10 @@
 
 mod boundary;
 mod context;
+mod edit;
+mod files;
+mod label;
+mod options;
 mod progress;
 mod render;
 mod scene;
@@ -16,6 +20,10 @@ mod train;
 mod types;
 
 pub use context::*;
+pub use edit::*;
+pub use files::*;
+pub use label::*;
+pub use options::*;
 pub use render::*;
 pub use scene::*;
 pub use train::*;

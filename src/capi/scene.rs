@@ -32,7 +32,10 @@ impl SvkScene {
 }
 
 /// Runs the body of a function with a scene.
-unsafe fn with(scene: *const SvkScene, body: impl FnOnce(&SvkScene) -> Result<(), CallError>) -> SvkStatus {
+pub(super) unsafe fn with(
+    scene: *const SvkScene,
+    body: impl FnOnce(&SvkScene) -> Result<(), CallError>,
+) -> SvkStatus {
     // SAFETY: per the header.
     match unsafe { scene.as_ref() } {
         Some(scene) => guard(&scene.error, || body(scene)),

@@ -46,6 +46,7 @@ pub unsafe extern "C" fn svk_train(
             // Options are checked before the photos are read.
             let networks = inventory(&context.registry);
             let config = config(&options, &networks)?;
+            let masks = boundary::path(options.photo_masks, "SvkTrainOptions.photo_masks")?;
             let progress = Callback::new(options.progress, options.user);
             let max_size = match options.max_size as usize {
                 0 => photo::default_max_size(context.device.info().is_cpu),
@@ -54,7 +55,7 @@ pub unsafe extern "C" fn svk_train(
                 }
                 n => n,
             };
-            let (photos, cameras) = gather(&given, options.views as usize, max_size, &progress)?;
+            let (photos, cameras) = gather(&given, options.views as usize, masks, max_size, &progress)?;
             if !cameras.is_empty() && config.geometry.init != GeometryConfig::default().init {
                 return bad_argument(
                     "cameras are given with the photos and in the options; give one of them",
@@ -75,6 +76,7 @@ pub unsafe extern "C" fn svk_train(
 unsafe fn gather(
     given: &[SvkPhoto],
     views: usize,
+    masks: Option<PathBuf>,
     max_size: usize,
     progress: &dyn Progress,
 ) -> Result<(Vec<Photo>, Vec<Camera>), CallError> {
@@ -87,11 +89,16 @@ unsafe fn gather(
         );
     }
     let in_memory = given.iter().any(|p| !p.encoded.is_null() || !p.pixels.is_null());
+    if masks.is_some() && (in_memory || paths.iter().any(Option::is_none)) {
+        return bad_argument(
+            "SvkTrainOptions.photo_masks: belongs to photos from files; pixels have SvkPhoto.mask",
+        );
+    }
     let photos = if !in_memory && paths.iter().all(Option::is_some) {
         let paths: Vec<PathBuf> = paths.into_iter().flatten().collect();
         let all = if views > 0 || paths.iter().any(|p| p.is_dir()) { None } else { Some(paths.len()) };
         let (mut chosen, _) = choose::photos(&paths, if views > 0 { Some(views) } else { all }, progress)?;
-        photo::assign_masks(&mut chosen, &MaskChoice::default(), progress)?;
+        photo::assign_masks(&mut chosen, &MaskChoice { folder: masks, ..MaskChoice::default() }, progress)?;
         photo::load_each(&chosen, max_size, progress)?
     } else {
         // SAFETY: photos of the host, as the header describes them.
@@ -244,7 +251,7 @@ unsafe fn config(o: &SvkTrainOptions, networks: &Inventory) -> Result<Reconstruc
 }
 
 /// Source by name, by the file or folder of an older field, or the built-in one.
-fn source<K: SourceKind>(
+pub(super) fn source<K: SourceKind>(
     named: Option<String>,
     given: Option<SourceChoice>,
 ) -> Result<SourceChoice, CallError> {
@@ -260,7 +267,9 @@ fn source<K: SourceKind>(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::format::picture;
     use crate::progress::Silent;
+    use std::ffi::CString;
 
     #[test]
     fn pixels_skips_row_padding() {
@@ -290,7 +299,36 @@ mod tests {
         assert!(!photo.uses(9 * 64 + 63) && photo.uses(10 * 64));
         let encoded = SvkPhoto { encoded: grey.as_ptr(), encoded_bytes: 9, ..size };
         // SAFETY: refused before anything is read.
-        assert!(matches!(unsafe { gather(&[encoded], 0, 64, &Silent) }, Err(CallError::Argument(_))));
+        assert!(matches!(unsafe { gather(&[encoded], 0, None, 64, &Silent) }, Err(CallError::Argument(_))));
+    }
+
+    #[test]
+    fn photo_masks_exclude_black_pixels() {
+        let folder = tempfile::tempdir().unwrap();
+        let masks = folder.path().join("people");
+        std::fs::create_dir(&masks).unwrap();
+        let files = [("a", 0.3), ("b", 0.6)].map(|(name, grey)| {
+            let file = folder.path().join(format!("{name}.png"));
+            picture::write_png(&file, &RgbImage::filled(64, 64, [grey; 3])).unwrap();
+            CString::new(file.to_str().unwrap()).unwrap()
+        });
+        let mut mask = RgbImage::filled(64, 64, [1.0; 3]);
+        mask.data[..64 * 10].fill([0.0; 3]);
+        picture::write_png(&masks.join("a.png"), &mask).unwrap();
+        // SAFETY: zero is a value.
+        let none: SvkPhoto = unsafe { std::mem::zeroed() };
+        let given = files.each_ref().map(|file| SvkPhoto { path: file.as_ptr(), ..none });
+        // SAFETY: the paths live as long as the call.
+        let read = |masks: Option<PathBuf>| unsafe { gather(&given, 0, masks, 64, &Silent) }.ok().unwrap().0;
+        let (with, without) = (read(Some(masks.clone())), read(None));
+        assert!(!with[0].uses(9 * 64 + 63) && with[0].uses(10 * 64) && with[1].uses(0));
+        assert!(without[0].uses(0));
+        let pixels = SvkPhoto { pixels: b"abc".as_ptr(), pixel_bytes: 3, width: 1, height: 1, ..none };
+        // SAFETY: refused before anything is read.
+        assert!(matches!(
+            unsafe { gather(&[pixels], 0, Some(masks), 64, &Silent) },
+            Err(CallError::Argument(_))
+        ));
     }
 
     #[test]

@@ -1,8 +1,8 @@
 //! Enumerations and structures of the C interface.
 use std::ffi::{c_char, c_void};
 
-/// Result of a function. After any other status than SVK_STATUS_OK, svk_context_error or
-/// svk_scene_error returns a text.
+/// Result of a function. After any other status than SVK_STATUS_OK, svk_context_error,
+/// svk_scene_error or svk_editor_error returns a text.
 #[repr(i32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkStatus {
@@ -38,6 +38,9 @@ pub enum SvkStatus {
     /// A file cannot be written: the disk is full, or the folder is not writable. No partial file
     /// remains.
     Unwritable = 13,
+    /// An edit was not made, because its selection may be wrong: nothing is changed.
+    /// svk_editor_doubts returns the reasons, and SvkEdit.force edits anyway.
+    Doubtful = 14,
 }
 
 /// Trade-off between time and quality.
@@ -294,9 +297,9 @@ pub struct SvkProgress {
     pub note: *const c_char,
 }
 
-/// Progress callback. It is called from any thread, but never from two at a time, and not after
-/// svk_train returns. A result other than 0 stops the training. It must not throw an exception or
-/// call functions with the context that trains.
+/// Progress callback. It is called from any thread, but never from two at a time, and not after the
+/// function returns that it was given to. A result other than 0 stops the work. It must not throw
+/// an exception or call functions with the context or the scene that works.
 pub type SvkProgressFunction =
     Option<unsafe extern "C" fn(user: *mut c_void, progress: *const SvkProgress) -> i32>;
 
@@ -358,6 +361,9 @@ pub struct SvkTrainOptions {
     pub depth_prior: *const c_char,
     /// Things that are ignored in all photos, as by --ignore, one a line. NULL = none.
     pub ignore: *const c_char,
+    /// Folder of a mask per photo, as of --photo-masks: x.png or x.jpg.png for x.jpg, black is not
+    /// used. All photos must be files. NULL = masks beside the photos, if there are any.
+    pub photo_masks: *const c_char,
 }
 
 /// Contents of a scene.
