@@ -478,6 +478,14 @@ fn label_gives_splats_language() {
     let list = || unsafe { svk_scene_objects(kept, things.as_ptr(), null(), null_mut()) };
     assert_eq!(list(), SvkStatus::Input);
     assert!(scene_error(kept).contains("save it first"), "{}", scene_error(kept));
+    let (ply, model) = (text(&folder.path().join("kept.ply")), CString::new("colmap").unwrap());
+    let export =
+        |options: SvkExportOptions| unsafe { svk_scene_export(kept, ply.as_ptr(), &options, null_mut(), 0) };
+    assert_eq!(export(SvkExportOptions { format: model.as_ptr(), ..zeros() }), SvkStatus::Input);
+    assert!(scene_error(kept).contains("save the scene first"), "{}", scene_error(kept));
+    assert_eq!(export(SvkExportOptions { raw: 1, guessed: 1, ..zeros() }), SvkStatus::Ok);
+    let written = gaussians::read(&folder.path().join("kept.ply")).unwrap().0;
+    assert_eq!(written.means, given.means);
     let saved = text(&folder.path().join("saved"));
     assert_eq!(unsafe { svk_scene_save(kept, saved.as_ptr(), 0) }, SvkStatus::Ok);
     assert_eq!(list(), SvkStatus::Ok, "{}", scene_error(kept));

@@ -85,9 +85,9 @@ pub unsafe extern "C" fn svk_editor_edit(
     // SAFETY: per the header.
     unsafe {
         with(editor, |handle| {
+            let mut editor = lock(&handle.editor);
             handle.doubts.set(String::new());
             let edit = boundary::read(edit)?;
-            let mut editor = lock(&handle.editor);
             let (operation, terms) = operation(&edit, &editor)?;
             let selected = editor.select(&terms)?;
             if !edited.is_null() {

@@ -4,18 +4,16 @@ use super::options::*;
 use super::progress::Callback;
 use super::scene::{SvkScene, with};
 use super::types::SvkStatus;
-use crate::format::cameras;
 use crate::format::scene_dir::Scene;
 use crate::progress::Progress;
-use crate::run::Machine;
 use crate::run::export::{Asked, ExportPlan};
-use crate::run::mesh::{MeshPlan, TRIANGLES};
+use crate::run::mesh::{Collider, MeshPlan, TRIANGLES};
 use crate::run::metric::Distance;
 use crate::run::objects::{self, LEAST_SHARE, Listed, ObjectFiles, ObjectOptions};
+use crate::run::{Machine, stored};
 use crate::scene::UpAxis;
 use crate::sync::lock;
 use serde_json::Value;
-use splatvk_mesh::Collider;
 use std::ffi::c_char;
 use std::path::{Path, PathBuf};
 
@@ -180,11 +178,6 @@ unsafe fn mesh_plan(
         2 => Some(Collider::Decomposition),
         other => return bad_argument(format!("SvkMeshOptions.collider is {other}; an SvkCollider")),
     };
-    let given = given.map(|file| cameras::read_file(file).map(|read| read.pinholes())).transpose()?;
-    let given = given.map(|(cameras, warnings)| {
-        warnings.iter().for_each(|warning| progress.warn(warning));
-        cameras
-    });
     let triangles = usize::try_from(o.triangles).unwrap_or(usize::MAX);
     Ok(MeshPlan {
         triangles: if triangles == 0 { TRIANGLES } else { triangles },
@@ -194,7 +187,7 @@ unsafe fn mesh_plan(
         collider,
         by_object: o.by_object != 0,
         vocabulary: words(text(o.vocabulary, "vocabulary")?)?,
-        cameras: given,
+        cameras: given.map(|file| stored::cameras(file, progress)).transpose()?,
         raw: o.raw != 0,
         ..MeshPlan::default()
     })

@@ -307,12 +307,13 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let masks = folder.path().join("people");
         std::fs::create_dir(&masks).unwrap();
+        let plain = |grey| RgbImage { width: 64, height: 64, data: vec![[grey; 3]; 64 * 64] };
         let files = [("a", 0.3), ("b", 0.6)].map(|(name, grey)| {
             let file = folder.path().join(format!("{name}.png"));
-            picture::write_png(&file, &RgbImage::filled(64, 64, [grey; 3])).unwrap();
+            picture::write_png(&file, &plain(grey)).unwrap();
             CString::new(file.to_str().unwrap()).unwrap()
         });
-        let mut mask = RgbImage::filled(64, 64, [1.0; 3]);
+        let mut mask = plain(1.0);
         mask.data[..64 * 10].fill([0.0; 3]);
         picture::write_png(&masks.join("a.png"), &mask).unwrap();
         // SAFETY: zero is a value.
@@ -325,10 +326,8 @@ mod tests {
         assert!(without[0].uses(0));
         let pixels = SvkPhoto { pixels: b"abc".as_ptr(), pixel_bytes: 3, width: 1, height: 1, ..none };
         // SAFETY: refused before anything is read.
-        assert!(matches!(
-            unsafe { gather(&[pixels], 0, Some(masks), 64, &Silent) },
-            Err(CallError::Argument(_))
-        ));
+        let refused = unsafe { gather(&[pixels], 0, Some(masks), 64, &Silent) };
+        assert!(matches!(refused, Err(CallError::Argument(_))));
     }
 
     #[test]

@@ -4,11 +4,10 @@ use super::print::{print, print_json};
 use super::{objects, progress, scene, views};
 use crate::Result;
 use crate::format::mesh::MeshFormat;
-use crate::run::mesh::{MeshPlan, TRIANGLES};
+use crate::run::mesh::{Collider, MeshPlan, TRIANGLES};
 use crate::run::metric::Distance;
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
-use splatvk_mesh::Collider;
 use std::path::{Path, PathBuf};
 
 /// `splatvk mesh`

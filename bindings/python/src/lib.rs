@@ -6,6 +6,7 @@ mod camera;
 mod device;
 mod edit;
 mod errors;
+mod files;
 mod scene;
 mod work;
 
@@ -22,7 +23,9 @@ mod _splatvk {
     #[pymodule_export]
     use crate::edit::{Editor, Selection};
     #[pymodule_export]
-    use crate::scene::{Scene, load, objects, options, reconstruct, reconstruct_pixels};
+    use crate::files::{export, mesh, objects};
+    #[pymodule_export]
+    use crate::scene::{Scene, load, options, reconstruct, reconstruct_pixels};
     #[pymodule_export]
     use crate::work::Event;
     use pyo3::prelude::*;

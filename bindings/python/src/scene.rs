@@ -11,11 +11,9 @@ use serde_json::{Map, Value};
 use splatvk::format::scene_dir;
 use splatvk::infer::Registry;
 use splatvk::photo;
-use splatvk::progress::Silent;
 use splatvk::query::instances::splat_codes;
 use splatvk::run::live::LiveScene;
-use splatvk::run::objects::{self as things, ObjectOptions};
-use splatvk::run::{self, Extras, Machine, RunPlan};
+use splatvk::run::{self, Extras, RunPlan};
 use splatvk::scene::{LEVEL_NAMES, RgbImage};
 use splatvk::{Error, Result};
 use std::path::{Path, PathBuf};
@@ -420,30 +418,6 @@ pub fn load(
         LiveScene::loaded(&device, scene?, &Registry::open(models.as_deref())?)
     })?;
     Ok(Scene::of(live, Some(std::path::absolute(&path)?)))
-}
-
-/// The things of a scene directory with its edits, as JSON: the list `objects` of objects.json.
-#[pyfunction]
-#[pyo3(signature = (path, vocabulary = None, min_share = None, device = None, models = None))]
-pub fn objects(
-    py: Python<'_>,
-    path: PathBuf,
-    vocabulary: Option<Vec<String>>,
-    min_share: Option<f64>,
-    device: Option<String>,
-    models: Option<PathBuf>,
-) -> PyResult<String> {
-    let machine = Machine { device, models, ..Machine::default() };
-    let least_share = min_share.unwrap_or(things::LEAST_SHARE);
-    let options = ObjectOptions { vocabulary, least_share };
-    work::unobserved(py, || {
-        let mut scene = scene_dir::load(&path)?;
-        let (_, list) = things::of_scene(&mut scene, &machine, &options, &Silent)?;
-        let views: Vec<String> =
-            scene.cameras.iter().map(|camera| photo::stem(&camera.name).to_owned()).collect();
-        let records: Vec<Value> = list.iter().map(|o| o.record(&list, &views, &scene.world)).collect();
-        Ok(Value::from(records).to_string())
-    })
 }
 
 /// Options of [`reconstruct`] with their defaults, as JSON.

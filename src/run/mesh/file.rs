@@ -1,5 +1,7 @@
 //! A mesh as a file: things, place in the world, figures.
-use super::{MeshOptions, Placement, SceneMesh, Things, add_colliders, on_device, placed};
+use super::{
+    Collider, MeshOptions, Placement, SceneMesh, Simplify, Things, add_colliders, on_device, placed,
+};
 use crate::format::mesh::{self, MeshFile, MeshFormat};
 use crate::format::scene_dir::Scene;
 use crate::progress::Progress;
@@ -10,7 +12,6 @@ use crate::run::{Machine, stored};
 use crate::scene::{Camera, LEVEL_NAMES, Mesh, World};
 use crate::{Error, Result};
 use serde_json::{Value, json};
-use splatvk_mesh::{Collider, Simplify};
 use std::path::Path;
 
 /// Default of [`MeshPlan::triangles`].
@@ -82,8 +83,10 @@ impl MeshPlan {
         if self.triangles == 0 {
             return Err(Error::input("--triangles 0: give at least 1"));
         }
-        if let Some(length) = [self.error, self.voxel].into_iter().flatten().find(|l| !l.is_positive()) {
-            return Err(Error::input(format!("{length:?}: give a length above 0")));
+        for (option, length) in [("--error", self.error), ("--voxel", self.voxel)] {
+            if length.is_some_and(|length| !length.is_positive()) {
+                return Err(Error::input(format!("{option}: give a length above 0")));
+            }
         }
         Ok(MeshOutput { plan: self, format, out: WrittenFile::open(file, force, inputs)? })
     }

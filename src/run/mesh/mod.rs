@@ -11,10 +11,11 @@ use crate::gpu::{self, Device};
 use crate::progress::Progress;
 use crate::scene::{Camera, Mesh};
 use crate::{Error, Result};
-use splatvk_mesh::{Collider, Frame, Simplify, Tsdf, TsdfOptions, border_edges, build};
+use splatvk_mesh::{Frame, Tsdf, TsdfOptions, border_edges, build};
 
 pub use file::{MeshOutput, MeshPlan, TRIANGLES};
 pub use place::{Placement, placed};
+pub use splatvk_mesh::{Collider, Simplify};
 pub use things::Things;
 
 /// Settings of a mesh.

@@ -72,8 +72,10 @@ __all__ = [
     "__version__",
     "close_device",
     "device_name",
+    "export",
     "label",
     "load",
+    "mesh",
     "objects",
     "reconstruct",
     "train",
@@ -212,21 +214,190 @@ def label(
     return _splatvk.reconstruct(_json.dumps(plan), _progress.observer(progress))
 
 
-def objects(scene, *, vocabulary=None, min_share=None, device=None, models=None):
+def objects(
+    scene,
+    *,
+    vocabulary=None,
+    min_share=None,
+    out=None,
+    level="whole",
+    format="ply",
+    raw=False,
+    force=False,
+    progress=False,
+    device=None,
+    models=None,
+):
     """The things of a scene, as `splatvk objects`.
 
     Parameters
     ----------
-    scene : path
-        A scene directory with language; its edits apply.
+    scene : path or Scene
+        A scene directory with language, whose edits apply, or a scene that is stored.
     vocabulary : sequence of str, optional
         Names to choose from; without it those of the text model.
     min_share : float, optional
         Smallest share of the opacity of the scene that is a thing.
+    out : path, optional
+        Folder for objects.json, objects.csv, a file and a picture per thing, scene.glb and
+        scene.ply. Only with `force=True` are files of the same names replaced.
+    level : {"whole", "part", "subpart"}
+        Level of the files.
+    format : str
+        Format of the file of each thing, as of `splatvk objects --format`.
+    raw : bool
+        Keep the axes and the unit of the scene in the files; otherwise they are upright and in
+        metres, as far as the scene states them.
+    progress : bool or callable
+        As in `reconstruct`.
 
     Returns
     -------
     list of dict
         The entries of objects.json: id, level, parent, name, boxes in scene units and in metres.
     """
-    return _json.loads(_splatvk.objects(_os.fspath(scene), vocabulary, min_share, device, models))
+    options = {
+        "vocabulary": vocabulary,
+        "min_share": min_share,
+        "out": out,
+        "level": level,
+        "format": format,
+        "raw": raw,
+        "force": force,
+    }
+    observer = _progress.observer(progress)
+    return _json.loads(_splatvk.objects(scene, options, observer, device, models))
+
+
+def export(
+    scene,
+    path,
+    *,
+    format=None,
+    up=None,
+    metres=False,
+    raw=False,
+    guessed=False,
+    ply_degree=3,
+    spz_version=None,
+    with_features=False,
+    title=None,
+    views=None,
+    force=False,
+    progress=False,
+):
+    """Writes a scene for another program, as `splatvk export`: upright and in metres as far as the
+    scene states them, without the splats that no photo shows.
+
+    Parameters
+    ----------
+    scene : path or Scene
+        A scene directory, whose edits apply, a file of Gaussians, or a scene. Pages and COLMAP
+        models need a scene that is stored.
+    path : path
+        File or folder. Its ending states the format, unless `format` does.
+    up : {"-y", "y", "z"}, optional
+        Axis that points up; InputError where the direction up is not known.
+    metres : bool
+        InputError where metres are not known.
+    raw : bool
+        Keep the axes and the unit of the scene, as `scene.save` does.
+    guessed : bool
+        Keep what no photo shows.
+    ply_degree, spz_version, with_features, title, views
+        As the options of `splatvk export`.
+    force : bool
+        Replace an ordinary file, or files of the same names in a folder.
+    progress : bool or callable
+        As in `reconstruct`.
+
+    Returns
+    -------
+    dict
+        `summary`, one line on what was done; `up` and `metres`, None where they are as in the scene;
+        `splats` and `guessed`, or `cameras` and `points`; `files`.
+    """
+    options = {
+        "format": format,
+        "up": up,
+        "metres": metres,
+        "raw": raw,
+        "guessed": guessed,
+        "ply_degree": ply_degree,
+        "spz_version": spz_version,
+        "with_features": with_features,
+        "title": title,
+        "views": views,
+        "force": force,
+    }
+    return _json.loads(_splatvk.export(scene, path, options, _progress.observer(progress)))
+
+
+def mesh(
+    scene,
+    path,
+    *,
+    triangles=100_000,
+    error=None,
+    voxel=None,
+    fill_guessed=False,
+    collider=None,
+    by_object=False,
+    vocabulary=None,
+    cameras=None,
+    raw=False,
+    force=False,
+    progress=False,
+    device=None,
+    models=None,
+):
+    """Writes the surfaces of a scene as triangles, as `splatvk mesh`: upright, in metres and on the
+    ground, as far as the scene states them.
+
+    Parameters
+    ----------
+    scene : path or Scene
+        A scene directory, whose edits apply, or a scene. A file of Gaussians needs `cameras`.
+    path : path
+        A .glb, .ply or .obj.
+    triangles : int
+        Most triangles.
+    error, voxel : str or float, optional
+        Length by which 99.9 % of the surface may move, instead of `triangles`; side of a voxel. "2mm"
+        or "0.5cm" where the scale is known, or a number in scene units.
+    fill_guessed : bool
+        Also surfaces that no photo shows; otherwise they are holes.
+    collider : {"hull", "decomposition"}, optional
+        Shapes for physics beside every part; not in a .ply.
+    by_object : bool
+        A part with a name for every thing of a stored scene; `vocabulary` has names to choose from.
+    cameras : path, optional
+        Cameras to look from, instead of those of the scene.
+    raw : bool
+        Keep the axes, the unit and the origin of the scene.
+    force : bool
+        Replace an ordinary file.
+    progress : bool or callable
+        As in `reconstruct`.
+
+    Returns
+    -------
+    dict
+        Figures: `triangles`, `vertices`, `parts`, `unit`, `up`, `size`, `area`, `border_edges`,
+        `voxel` and `moved` in the unit of the file, and `from_scene`: file = scale · rotation ·
+        scene + translation, rotation row by row.
+    """
+    options = {
+        "triangles": triangles,
+        "error": None if error is None else str(error),
+        "voxel": None if voxel is None else str(voxel),
+        "fill_guessed": fill_guessed,
+        "collider": collider,
+        "by_object": by_object,
+        "vocabulary": vocabulary,
+        "cameras": cameras,
+        "raw": raw,
+        "force": force,
+    }
+    observer = _progress.observer(progress)
+    return _json.loads(_splatvk.mesh(scene, path, options, observer, device, models))

@@ -22,8 +22,10 @@ __all__ = [
     "__version__",
     "close_device",
     "device_name",
+    "export",
     "load",
     "main",
+    "mesh",
     "objects",
     "options",
     "reconstruct",
@@ -196,9 +198,20 @@ def load(
     path: _Path, device: str | None = None, models: _Path | None = None, edits: bool = True
 ) -> Scene: ...
 def objects(
+    scene: Scene | _Path,
+    options: dict[str, Any],
+    observer: Callable[[Event], object],
+    device: str | None = None,
+    models: _Path | None = None,
+) -> str: ...
+def export(
+    scene: Scene | _Path, path: _Path, options: dict[str, Any], observer: Callable[[Event], object]
+) -> str: ...
+def mesh(
+    scene: Scene | _Path,
     path: _Path,
-    vocabulary: Sequence[str] | None = None,
-    min_share: float | None = None,
+    options: dict[str, Any],
+    observer: Callable[[Event], object],
     device: str | None = None,
     models: _Path | None = None,
 ) -> str: ...
