@@ -1457,6 +1457,11 @@ typedef struct {
      Number of reasons why the selection may be wrong; svk_editor_doubts returns them.
      */
     uint64_t doubts;
+    /*
+     Number of splats that a deletion took along: those behind the selected ones, which no photo
+     shows.
+     */
+    uint64_t along;
 } SvkEdited;
 
 #ifdef __cplusplus
@@ -1688,7 +1693,7 @@ size_t svk_editor_error(const SvkEditor *editor, char *text, size_t bytes);
  is changed, `edited` is filled, and svk_editor_doubts returns the reasons. A word that the scene
  does not contain, a selection of nothing and an edit that leaves no splat are SVK_STATUS_INPUT.
  Thread-safe; calls with one editor are serialised. A list that another program changed
- meanwhile is refused.
+ meanwhile is refused; a new editor has it.
  */
 SvkStatus svk_editor_edit(SvkEditor *editor, const SvkEdit *edit, SvkEdited *edited);
 

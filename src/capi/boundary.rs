@@ -157,7 +157,7 @@ versioned!(
     SvkMeshInfo 72,
     SvkObjectsOptions 64,
     SvkEdit 80,
-    SvkEdited 32
+    SvkEdited 40
 );
 
 /// Size that a structure states, bytes.

@@ -75,7 +75,7 @@ pub unsafe extern "C" fn svk_editor_error(
 /// is changed, `edited` is filled, and svk_editor_doubts returns the reasons. A word that the scene
 /// does not contain, a selection of nothing and an edit that leaves no splat are SVK_STATUS_INPUT.
 /// Thread-safe; calls with one editor are serialised. A list that another program changed
-/// meanwhile is refused.
+/// meanwhile is refused; a new editor has it.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn svk_editor_edit(
     editor: *mut SvkEditor,
@@ -90,10 +90,12 @@ pub unsafe extern "C" fn svk_editor_edit(
             let edit = boundary::read(edit)?;
             let (operation, terms) = operation(&edit, &editor)?;
             let selected = editor.select(&terms)?;
-            if !edited.is_null() {
-                let (splats, doubts) = (selected.count as u64, selected.doubts.len() as u64);
-                boundary::write(edited, &SvkEdited { size: 0, splats, share: selected.share, doubts })?;
-            }
+            let (splats, doubts) = (selected.count as u64, selected.doubts.len() as u64);
+            let outcome = SvkEdited { size: 0, splats, share: selected.share, doubts, along: 0 };
+            let fill = |outcome: &SvkEdited| {
+                if edited.is_null() { Ok(()) } else { boundary::write(edited, outcome) }
+            };
+            fill(&outcome)?;
             handle.doubts.set(selected.doubts.join("\n"));
             if edit.dry_run != 0 {
                 return Ok(());
@@ -103,7 +105,8 @@ pub unsafe extern "C" fn svk_editor_edit(
                     "{doubt}; nothing is changed: SvkEdit.force edits anyway"
                 )));
             }
-            Ok(editor.push(vec![(operation, selected)])?)
+            let along = editor.push(vec![(operation, selected)])? as u64;
+            fill(&SvkEdited { along, ..outcome })
         })
     }
 }

@@ -261,4 +261,7 @@ pub struct SvkEdited {
     pub share: f64,
     /// Number of reasons why the selection may be wrong; svk_editor_doubts returns them.
     pub doubts: u64,
+    /// Number of splats that a deletion took along: those behind the selected ones, which no photo
+    /// shows.
+    pub along: u64,
 }
