@@ -13,7 +13,7 @@ use splatvk::format::scene_dir::Scene;
 use splatvk::gpu::{self, Device};
 use splatvk::query::clicks::Standing;
 use splatvk::query::instances::{Places, splat_codes};
-use splatvk::query::things::numbers;
+use splatvk::query::things::{Thing, numbers};
 use splatvk::run::objects::LEAST_SHARE;
 use splatvk::run::view::BlendedValues;
 use splatvk::scene::{Camera, Image, LEVEL_NAMES};
@@ -22,6 +22,10 @@ use std::path::Path;
 
 /// Share of the picture below which a segment is small: the largest are ground and walls.
 const SMALL: f64 = 0.1;
+/// Level of the parts.
+const PARTS: usize = 1;
+/// Number of the first surface; no thing has as high a number.
+const SURFACE: u32 = 1 << 31;
 /// Blending weight from which a pixel shows a thing.
 const SHOWN: f32 = 0.5;
 
@@ -35,11 +39,11 @@ pub fn object_accuracy(args: &ObjectAccuracyArgs) -> Result<()> {
     }
     let device = gpu::open(args.device.device.as_deref())?;
     // Per partition all segments and small ones.
-    let mut scores = vec![[Panoptic::default(); 2]; LEVEL_NAMES.len() + 1];
+    let mut scores = vec![[Panoptic::default(); 2]; LEVEL_NAMES.len() + 2];
     for (scene, truth) in args.scenes.iter().zip(&args.ground_truth) {
         add(scene, truth, &device, &mut scores)?;
     }
-    let levels = LEVEL_NAMES.iter().chain([&"whole"]).zip(&scores);
+    let levels = LEVEL_NAMES.iter().chain([&"click", &"object"]).zip(&scores);
     if args.device.json {
         let figures = |score: &Panoptic| {
             json!({
@@ -97,7 +101,8 @@ fn add(path: &Path, folder: &Path, device: &Device, scores: &mut [[Panoptic; 2]]
 fn partitions(scene: &Scene) -> Result<Vec<Vec<u32>>> {
     let field = scene.language.as_ref().ok_or_else(|| Error::input("the scene has no language"))?;
     let count = scene.splats.len();
-    let all = Places::of(&scene.splats, field).things(LEAST_SHARE);
+    let places = Places::of(&scene.splats, field);
+    let all = places.things(LEAST_SHARE);
     let mut partitions: Vec<Vec<u32>> =
         (0..LEVEL_NAMES.len()).map(|level| numbers(all.iter(), level, count)).collect();
     let codes: Vec<_> = field.levels.iter().map(splat_codes).collect();
@@ -109,7 +114,19 @@ fn partitions(scene: &Scene) -> Result<Vec<Vec<u32>>> {
         (number > 0).then_some(number + ((level as u32) << 28))
     };
     partitions.push((0..count).map(|i| whole(i).unwrap_or(0)).collect());
+    partitions.push(objects(&places, &all, count));
     Ok(partitions)
+}
+
+/// Parts, those on a surface as one.
+fn objects(places: &Places, things: &[Thing], count: usize) -> Vec<u32> {
+    let parts: Vec<Thing> = things.iter().filter(|thing| thing.level == PARTS).cloned().collect();
+    let mut owners = vec![0; count];
+    for (part, surface) in parts.iter().zip(places.surfaces(&parts)) {
+        let owner = surface.map_or(part.number(), |surface| SURFACE + surface as u32);
+        part.instance.splats.iter().for_each(|i| owners[*i] = owner);
+    }
+    owners
 }
 
 /// Per view the owner of most of every pixel, 0 = none.

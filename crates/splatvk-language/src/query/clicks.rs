@@ -1,6 +1,7 @@
 //! Level that a click selects: the whole thing, without the surface it stands on
 //! (docs/use/viewer.md).
 use super::instances::splat_codes;
+use super::surfaces::Plane;
 use crate::math::Random;
 use crate::scene::{Camera, LanguageField, Splats};
 use glam::Vec3;
@@ -53,7 +54,7 @@ impl Standing {
             standing.sizes.push(sizes);
             let mut pairs = Vec::new();
             for (code, list) in members.iter().filter(|m| level > 0 && m.1.len() >= LEAST_SURFACE) {
-                let Some(plane) = Plane::of(&splats.means, list, &centres) else { continue };
+                let Some(plane) = Surface::of(&splats.means, list, &centres) else { continue };
                 for finer in 0..level {
                     let things = plane.carried(&splats.means, list, (&codes[finer], &standing.sizes[finer]));
                     pairs.extend(things.into_iter().map(|thing| [*code, finer, thing]));
@@ -100,7 +101,7 @@ fn grouped(codes: &[Option<usize>]) -> BTreeMap<usize, Vec<usize>> {
 }
 
 /// The surface of a code.
-struct Plane {
+struct Surface {
     /// Unit normal towards the cameras.
     normal: Vec3,
     offset: f32,
@@ -109,24 +110,14 @@ struct Plane {
     radius: f32,
 }
 
-impl Plane {
+impl Surface {
     /// The plane with most of a code's splats, if they are enough.
-    fn of(means: &[[f32; 3]], list: &[usize], cameras: &[Vec3]) -> Option<Plane> {
+    fn of(means: &[[f32; 3]], list: &[usize], cameras: &[Vec3]) -> Option<Surface> {
         let step = list.len().div_ceil(SAMPLES);
         let points: Vec<Vec3> = list.iter().step_by(step).map(|i| Vec3::from(means[*i])).collect();
         let thickness = THICKNESS * radius(&points);
-        let mut random = Random::new(0);
-        let mut best = (0, Vec3::ZERO, 0.0);
-        for _ in 0..TRIALS {
-            let [a, b, c] = random.sample::<3>(points.len()).map(|i| points[i]);
-            let normal = (b - a).cross(c - a).normalize_or_zero();
-            let offset = normal.dot(a);
-            let on = points.iter().filter(|p| (p.dot(normal) - offset).abs() < thickness).count();
-            if normal != Vec3::ZERO && on > best.0 {
-                best = (on, normal, offset);
-            }
-        }
-        let (on, mut normal, mut offset) = best;
+        let (plane, on) = Plane::most_common(&points, thickness, TRIALS, &mut Random::new(0));
+        let Plane { mut normal, mut offset } = plane;
         if (on as f64) < FLAT * points.len() as f64 {
             return None;
         }
@@ -136,7 +127,7 @@ impl Plane {
         }
         let inside: Vec<Vec3> =
             points.into_iter().filter(|p| (p.dot(normal) - offset).abs() < thickness).collect();
-        Some(Plane { normal, offset, thickness, radius: radius(&inside) })
+        Some(Surface { normal, offset, thickness, radius: radius(&inside) })
     }
 
     /// Codes of a finer level whose splats are mostly among `list` and in front of the plane.

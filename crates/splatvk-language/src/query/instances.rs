@@ -136,6 +136,11 @@ impl Places {
         }
     }
 
+    /// [N] centres, world units.
+    pub fn centres(&self) -> &[DVec3] {
+        &self.centres
+    }
+
     /// [N] opacities.
     pub fn weights(&self) -> &[f64] {
         &self.weights

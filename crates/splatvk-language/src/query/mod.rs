@@ -17,6 +17,7 @@ pub mod presence;
 mod result;
 mod score;
 pub mod select;
+mod surfaces;
 pub mod things;
 pub mod window;
 
