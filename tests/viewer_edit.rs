@@ -180,6 +180,17 @@ fn selections_are_combined_hidden_and_changed() {
     page.wait_for(SELECTED);
     press_button(&mut page, "Isolate");
     wait_for_edits(&mut page, 2);
+    // Hidden splats that an edit takes away are no longer hidden.
+    page.enter("Words, an id or a range", "opacity>0.5");
+    page.wait_for(SELECTED);
+    press_button(&mut page, "Hide");
+    page.enter("Words, an id or a range", "opacity>0.4");
+    page.wait_for(SELECTED);
+    press_button(&mut page, "Delete");
+    wait_for_edits(&mut page, 3);
+    assert_eq!(marked(&mut page, HIDDEN), 0);
+    assert_eq!(page.complaints.len(), 1, "the server refuses to select them: {:?}", page.complaints);
+    page.complaints.clear();
     let list = edits(&scene);
     assert!(
         matches!(list.edits[0].operation, Operation::Recolour { .. }) && list.edits[0].selection.len() == 3

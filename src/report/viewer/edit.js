@@ -90,10 +90,17 @@ async function change(request) {
   return true;
 }
 
-/// Hidden splats in the bitmaps of the present scene, without a selection.
+/// Hidden splats in the bitmaps of the present scene, without a selection. Parts that the edit took
+/// away are no longer hidden.
 async function afresh() {
   const hidden = [];
-  for (const { parts } of now.hidden) hidden.push({ parts, bits: (await send({ select: parts })).bits });
+  for (const { parts } of now.hidden) {
+    try {
+      hidden.push({ parts, bits: (await send({ select: parts })).bits });
+    } catch {
+      continue;
+    }
+  }
   return { parts: [], selected: null, hidden };
 }
 
