@@ -86,6 +86,9 @@ fn three_clicks_delete_as_one_command_does() {
     keep_screenshot(&mut page, "edit-selected.png");
     press_button(&mut page, "Delete");
     wait_for_edits(&mut page, 1);
+    page.wait_for(
+        "document.querySelector('.v-status').textContent.includes('behind them that no photo shows')",
+    );
     let (one, other) = (edits(&by_command), edits(&by_page));
     assert_eq!((one.edits.len(), &one.edits[0].splats), (1, &other.edits[0].splats));
     assert_eq!(other.edits[0].operation, Operation::Delete {});

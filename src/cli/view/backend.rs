@@ -100,6 +100,7 @@ impl Backend {
     }
 
     fn edit(&mut self, request: Request, live: &LiveSite) -> Result<Value> {
+        let mut along = 0;
         let changes = match request {
             Request::Select(parts) => return self.select(&parts),
             Request::Histogram(property) => {
@@ -114,7 +115,7 @@ impl Backend {
                 if let Some(doubt) = selected.doubts.first().filter(|_| !force) {
                     return Err(Error::input(format!("{doubt}; nothing is changed")));
                 }
-                self.editor.push(vec![(operation, selected)])?;
+                along = self.editor.push(vec![(operation, selected)])?;
                 true
             }
         };
@@ -123,7 +124,9 @@ impl Backend {
         }
         let list = self.editor.list();
         let lines = |edits: &[_]| edits.iter().map(entry).collect::<Vec<_>>();
-        Ok(json!({ "edits": lines(&list.edits), "undone": lines(&list.undone), "changed": changes }))
+        Ok(json!({
+            "edits": lines(&list.edits), "undone": lines(&list.undone), "changed": changes, "along": along,
+        }))
     }
 
     /// Gives the site the edited scene.

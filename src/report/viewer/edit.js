@@ -110,7 +110,8 @@ const edit = (operation, word) => alone(async () => {
   if (!selected) return say("Select something first.");
   await change({ edit: { operation, selection: parts, force: selected.doubts.length > 0 } });
   go(await afresh(), true);
-  say(`${selected.count.toLocaleString("en")} splats ${word}; undo brings them back.`);
+  const along = list.along ? `, and ${list.along.toLocaleString("en")} behind them that no photo shows` : "";
+  say(`${selected.count.toLocaleString("en")} splats ${word}${along}. Undo takes it back.`);
 });
 
 /// Undoes the last step of this page, or else the last edit of the scene.

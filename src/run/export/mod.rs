@@ -1,4 +1,5 @@
-//! A scene as a file of another program: format, selected splats, axes and unit (docs/use/export.md).
+//! A scene as a file of another program: format, selected splats, axes and unit
+//! (docs/use/export.md).
 mod losses;
 mod output;
 mod page;
