@@ -415,7 +415,7 @@ fn things_are_written_with_files() {
         (given, SvkStatus::Input, "things"),
         (SvkObjectsOptions { vocabulary: twice.as_ptr(), ..given }, SvkStatus::Input, "twice"),
         (SvkObjectsOptions { format: twice.as_ptr(), ..given }, SvkStatus::Input, "no format"),
-        (SvkObjectsOptions { pieces: 3, ..given }, SvkStatus::Argument, "SvkPieces"),
+        (SvkObjectsOptions { pieces: 4, ..given }, SvkStatus::Argument, "SvkPieces"),
         (SvkObjectsOptions { min_share: 2.0, ..given }, SvkStatus::Argument, "min_share"),
     ] {
         assert_eq!(write(options), status, "{reason}");
@@ -430,8 +430,8 @@ fn things_are_written_with_files() {
         let splats = gaussians::read(&out.join(thing["file"].as_str().unwrap())).unwrap().0;
         assert_eq!(thing["splats"], splats.len());
     }
-    let lemon = files.iter().find(|o| o["id"] == "l7").unwrap();
-    assert_eq!(lemon["names"][0]["text"], "lemon");
+    assert!(files.iter().all(|o| o["level"] == "o"));
+    assert!(files.iter().any(|o| o["name"] == "lemon" && o["named"] == true));
     assert!(["objects.csv", "scene.glb", "scene.ply"].iter().all(|name| out.join(name).is_file()));
     unsafe {
         svk_scene_destroy(scene);

@@ -6,6 +6,7 @@ use super::scene::{SvkScene, with};
 use super::types::SvkStatus;
 use crate::format::scene_dir::Scene;
 use crate::progress::Progress;
+use crate::query::things::OBJECTS;
 use crate::run::export::{Asked, ExportPlan};
 use crate::run::mesh::{Collider, MeshPlan, TRIANGLES};
 use crate::run::metric::Distance;
@@ -219,9 +220,10 @@ unsafe fn objects_plan(o: &SvkObjectsOptions) -> Result<(ObjectFiles, ObjectOpti
     let text =
         |pointer, field: &str| unsafe { boundary::text(pointer, &format!("SvkObjectsOptions.{field}")) };
     let level = match o.pieces {
-        0 => 2,
+        0 => OBJECTS,
         1 => 1,
         2 => 0,
+        3 => 2,
         other => return bad_argument(format!("SvkObjectsOptions.pieces is {other}; an SvkPieces")),
     };
     if !(0.0..=1.0).contains(&o.min_share) {

@@ -32,12 +32,14 @@ pub enum SvkUpAxis {
 #[repr(u32)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SvkPieces {
-    /// Things as a whole.
+    /// Things and surfaces, none of them within another.
     Things = 0,
-    /// Their parts.
+    /// Masks of parts.
     Parts = 1,
     /// Parts of parts.
     Subparts = 2,
+    /// Masks of wholes, which may join things with their table.
+    Wholes = 3,
 }
 
 /// Operation of an edit.
@@ -206,7 +208,7 @@ pub struct SvkObjectsOptions {
     pub min_share: f64,
     /// Format of the file of each thing, as of --format; NULL = "ply".
     pub format: *const c_char,
-    /// SvkPieces: level of the files; objects.json lists all three.
+    /// SvkPieces: level of the files; objects.json lists all.
     pub pieces: u32,
     /// 1 = files keep the axes and the unit of the scene; otherwise they are upright and in metres,
     /// as far as the scene states them.
@@ -234,7 +236,7 @@ pub struct SvkEdit {
     /// SVK_OPERATION_FLOATERS: 1 = also splats on the surface of one photo that more photos look
     /// through.
     pub thorough: u32,
-    /// Selection as of `splatvk edit`: words, ids of things ("id:l3"), ranges ("opacity<0.1",
+    /// Selection as of `splatvk edit`: words, ids of things ("id:o3"), ranges ("opacity<0.1",
     /// "size>5cm", "reliability<0.3", "seen<1"), joined with " + ", " - " or " & ". NULL with
     /// SVK_OPERATION_FLOATERS.
     pub selection: *const c_char,

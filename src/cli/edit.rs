@@ -26,7 +26,7 @@ pub enum FloaterRule {
 pub struct EditArgs {
     /// Scene directory
     pub scene: PathBuf,
-    /// Remove what is selected: words, ids of `splatvk objects` (id:l3), ranges (opacity<0.1,
+    /// Remove what is selected: words, ids of `splatvk objects` (id:o3), ranges (opacity<0.1,
     /// size>5cm, reliability<0.3, seen<1), joined with " + ", " - " or " & "
     #[arg(long, value_name = "SELECTION")]
     pub delete: Vec<String>,

@@ -3,6 +3,7 @@ use super::args::{DeviceArgs, EditUse, share};
 use super::print::{print, print_json};
 use super::{progress, scene};
 use crate::format::gaussians::FORMATS;
+use crate::query::things::OBJECTS;
 use crate::run::objects::{self, Listed, NOUNS, Object, ObjectFiles, ObjectOptions};
 use crate::{Result, files};
 use clap::builder::PossibleValuesParser;
@@ -13,18 +14,21 @@ use std::path::{Path, PathBuf};
 /// Levels of the files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum FileLevel {
-    /// Things as a whole
+    /// Things and surfaces, none of them within another
+    Object,
+    /// Masks of wholes, which may join things with their table
     Whole,
-    /// Their parts
+    /// Masks of parts
     Part,
     /// Parts of parts
     Subpart,
 }
 
 impl FileLevel {
-    /// Index as in [`crate::scene::LEVEL_NAMES`].
+    /// Index as in [`crate::query::things::LEVELS`].
     fn index(self) -> usize {
         match self {
+            FileLevel::Object => OBJECTS,
             FileLevel::Whole => 2,
             FileLevel::Part => 1,
             FileLevel::Subpart => 0,
@@ -41,8 +45,8 @@ pub struct ObjectsArgs {
     /// property `object` [default: only the list, nothing is written]
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
-    /// Level of the files; objects.json lists all three
-    #[arg(long, value_enum, default_value = "whole")]
+    /// Level of the files; objects.json lists all
+    #[arg(long, value_enum, default_value = "object")]
     pub level: FileLevel,
     /// Text file with names to choose from, one per line [default: those of the text model]
     #[arg(long, value_name = "FILE")]
@@ -107,7 +111,7 @@ fn table(list: &[Object], args: &ObjectsArgs) -> String {
     for object in &shown {
         let unsure = object.names.iter().find(|_| !object.is_named);
         let unsure = unsure.map_or(String::new(), |name| format!("   unsure: {}", name.text));
-        let (id, instance) = (object.id(), &object.thing.instance);
+        let (id, instance) = (object.thing.id(), &object.thing.instance);
         let _ = writeln!(
             text,
             "{id:>6}  {:<width$}  {:>5.1} %  {:>8} splats{unsure}",

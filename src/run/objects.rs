@@ -14,8 +14,8 @@ use crate::query::QueryOptions;
 use crate::query::instances::Instance;
 use crate::query::phrasing;
 use crate::query::presence::Presence;
-use crate::query::things::{self, Thing};
-use crate::scene::{Camera, LEVEL_NAMES, RgbImage, World};
+use crate::query::things::{self, LEVELS, Thing};
+use crate::scene::{Camera, RgbImage, World};
 use crate::{Error, Result};
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -29,8 +29,10 @@ const ASKED: usize = 3;
 /// is level and flat, too.
 const LEAST_SURFACE: f64 = 0.05;
 
-/// Nouns of the levels, finest first.
-pub const NOUNS: [&str; LEVEL_NAMES.len()] = ["subpart", "part", "thing"];
+/// Nouns of the levels of things.
+pub const NOUNS: [&str; LEVELS.len()] = ["subpart", "part", "whole", "thing"];
+/// Noun of an object that is a table, a wall or another plane.
+const SURFACE: &str = "surface";
 
 /// Settings of [`list`].
 #[derive(Clone, Debug)]
@@ -81,7 +83,7 @@ pub struct BestView {
 pub struct Object {
     /// Splats, boxes, level and parent.
     pub thing: Thing,
-    /// Name, unique in the list: the first found name, or the noun of the level with the number.
+    /// Name, unique on its level: the first found name, or the noun of the level with the number.
     pub name: String,
     /// Whether `name` was found; without, it is a number.
     pub is_named: bool,
@@ -92,21 +94,17 @@ pub struct Object {
 }
 
 impl Object {
-    /// Identifier, unique in the scene: level and label, "l3" or "l3.2".
-    pub fn id(&self) -> String {
-        format!("{}{}", LEVEL_NAMES[self.thing.level], self.thing.label())
-    }
-
     /// Entry of objects.json; `views` are the names of the views.
     pub fn record(&self, all: &[Object], views: &[String], world: &World) -> Value {
         let instance = &self.thing.instance;
         let metres = world.scale.as_ref().map(|scale| placement_json(instance, scale.metres_per_unit));
         let best = self.best_view.as_ref();
         let mut entry = placement_json(instance, 1.0);
-        entry["id"] = self.id().into();
+        entry["id"] = self.thing.id().into();
         entry["number"] = self.thing.number().into();
-        entry["level"] = LEVEL_NAMES[self.thing.level].into();
-        entry["parent"] = json!(self.thing.parent.and_then(|k| all.get(k)).map(Object::id));
+        entry["level"] = LEVELS[self.thing.level].into();
+        entry["surface"] = self.thing.is_surface.into();
+        entry["parent"] = json!(self.thing.parent.and_then(|k| all.get(k)).map(|o| o.thing.id()));
         entry["name"] = self.name.as_str().into();
         entry["named"] = self.is_named.into();
         entry["names"] = json!(self.names);
@@ -214,7 +212,8 @@ pub fn list(
     let mut objects: Vec<Object> = objects
         .map(|((thing, names), best_view)| {
             let found = names.iter().find(|name| name.presence == Some(Presence::Found));
-            let number = format!("{} {}", NOUNS[thing.level], thing.label());
+            let noun = if thing.is_surface { SURFACE } else { NOUNS[thing.level] };
+            let number = format!("{noun} {}", thing.label());
             let name = found.map_or(number, |found| found.text.clone());
             Object { is_named: found.is_some(), name, thing, names, best_view }
         })
@@ -223,13 +222,13 @@ pub fn list(
     Ok(objects)
 }
 
-/// Appends ".001", ".002" … to names that repeat, as Blender does.
+/// Appends ".001", ".002" … to names that repeat on a level, as Blender does.
 fn number_equal_names(objects: &mut [Object]) {
-    let mut used: BTreeSet<String> = BTreeSet::new();
+    let mut used: BTreeSet<(usize, String)> = BTreeSet::new();
     for object in objects {
         let name = object.name.clone();
         let mut copies = 0;
-        while !used.insert(object.name.clone()) {
+        while !used.insert((object.thing.level, object.name.clone())) {
             copies += 1;
             object.name = format!("{name}.{copies:03}");
         }
@@ -339,7 +338,7 @@ pub fn numbers(objects: &[Object], level: usize, splats: usize) -> Vec<u32> {
     things::numbers(objects.iter().map(|o| &o.thing), level, splats)
 }
 
-/// Number of objects per level, coarsest first, with the number of named ones.
+/// Number of things per level, objects first and then coarsest first, with that of named ones.
 pub fn counts(objects: &[Object]) -> Vec<(&'static str, usize, usize)> {
     let mut counts: BTreeMap<usize, (usize, usize)> = BTreeMap::new();
     for object in objects {
@@ -368,16 +367,18 @@ mod tests {
 
     #[test]
     fn equal_names_get_numbers() {
-        let object = |name: &str| Object {
-            thing: thing(&[1]),
+        let object = |level: usize, name: &str| Object {
+            thing: Thing { level, ..thing(&[1]) },
             name: name.into(),
             is_named: true,
             names: Vec::new(),
             best_view: None,
         };
-        let mut objects = ["chair", "chair", "chair.001", "lamp", "chair"].map(object);
+        let mut objects =
+            ["chair", "chair", "chair.001", "lamp", "chair"].map(|name| object(2, name)).to_vec();
+        objects.push(object(1, "chair"));
         number_equal_names(&mut objects);
         let names: Vec<&str> = objects.iter().map(|o| o.name.as_str()).collect();
-        assert_eq!(names, ["chair", "chair.001", "chair.001.001", "lamp", "chair.002"]);
+        assert_eq!(names, ["chair", "chair.001", "chair.001.001", "lamp", "chair.002", "chair"]);
     }
 }

@@ -224,9 +224,12 @@ fn listed(
     options: ObjectsOptions,
     progress: &dyn Progress,
 ) -> Result<Value> {
-    let levels = ["subpart", "part", "whole"];
+    let levels = ["subpart", "part", "whole", "object"];
     let level = levels.iter().position(|name| *name == options.level).ok_or_else(|| {
-        Error::input(format!("level {:?}: give \"whole\", \"part\" or \"subpart\"", options.level))
+        Error::input(format!(
+            "level {:?}: give \"object\", \"whole\", \"part\" or \"subpart\"",
+            options.level
+        ))
     })?;
     let files = ObjectFiles { level, format: options.format, raw: options.raw };
     let from = source.path();

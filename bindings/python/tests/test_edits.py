@@ -56,7 +56,7 @@ def test_refusals_change_nothing(copy):
 
 
 def test_things_can_be_deleted_by_id(copy):
-    things = [thing for thing in splatvk.objects(copy, min_share=0) if thing["level"] == "l"]
+    things = [thing for thing in splatvk.objects(copy, min_share=0) if thing["level"] == "o"]
     editor = splatvk.Editor(copy)
     smallest = min(things, key=lambda thing: thing["splats"])
     assert editor.delete(f"id:{smallest['id']}") >= smallest["splats"]

@@ -64,8 +64,8 @@ def test_things_are_written(scene, tmp_path):
     things = splatvk.objects(scene, min_share=0, out=out, format="spz")
     listed = json.loads((out / "objects.json").read_text())["objects"]
     assert things == listed and things
-    wholes = [thing for thing in things if thing["level"] == "l"]
-    assert wholes and all(len(splatvk.load(out / t["file"])) == t["splats"] for t in wholes)
+    objects = [thing for thing in things if thing["level"] == "o"]
+    assert objects and all(len(splatvk.load(out / t["file"])) == t["splats"] for t in objects)
     with pytest.raises(splatvk.InputError, match="subpart"):
         splatvk.objects(scene, level="atom")
 

@@ -13,7 +13,7 @@ use splatvk::format::scene_dir::Scene;
 use splatvk::gpu::{self, Device};
 use splatvk::query::clicks::Standing;
 use splatvk::query::instances::{Places, splat_codes};
-use splatvk::query::things::{Thing, numbers};
+use splatvk::query::things::{OBJECTS, numbers};
 use splatvk::run::objects::LEAST_SHARE;
 use splatvk::run::view::BlendedValues;
 use splatvk::scene::{Camera, Image, LEVEL_NAMES};
@@ -22,10 +22,6 @@ use std::path::Path;
 
 /// Share of the picture below which a segment is small: the largest are ground and walls.
 const SMALL: f64 = 0.1;
-/// Level of the parts.
-const PARTS: usize = 1;
-/// Number of the first surface; no thing has as high a number.
-const SURFACE: u32 = 1 << 31;
 /// Blending weight from which a pixel shows a thing.
 const SHOWN: f32 = 0.5;
 
@@ -114,19 +110,8 @@ fn partitions(scene: &Scene) -> Result<Vec<Vec<u32>>> {
         (number > 0).then_some(number + ((level as u32) << 28))
     };
     partitions.push((0..count).map(|i| whole(i).unwrap_or(0)).collect());
-    partitions.push(objects(&places, &all, count));
+    partitions.push(numbers(all.iter(), OBJECTS, count));
     Ok(partitions)
-}
-
-/// Parts, those on a surface as one.
-fn objects(places: &Places, things: &[Thing], count: usize) -> Vec<u32> {
-    let parts: Vec<Thing> = things.iter().filter(|thing| thing.level == PARTS).cloned().collect();
-    let mut owners = vec![0; count];
-    for (part, surface) in parts.iter().zip(places.surfaces(&parts)) {
-        let owner = surface.map_or(part.number(), |surface| SURFACE + surface as u32);
-        part.instance.splats.iter().for_each(|i| owners[*i] = owner);
-    }
-    owners
 }
 
 /// Per view the owner of most of every pixel, 0 = none.

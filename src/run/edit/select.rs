@@ -7,7 +7,7 @@ use crate::query::instances::Instance;
 use crate::query::presence::Presence;
 use crate::query::{MaskRule, QueryOptions};
 use crate::run::Compat;
-use crate::scene::{Camera, LEVEL_NAMES, LanguageField};
+use crate::scene::{Camera, LanguageField};
 use crate::{Error, Result};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -103,7 +103,7 @@ impl Editor {
         let answers = self.words()?.ask(text, &options)?;
         let refused = |reason: &str| {
             Err(Error::input(format!(
-                "\"{text}\": {reason}; splatvk objects lists the things of the scene, and \"id:l3\" selects one"
+                "\"{text}\": {reason}; splatvk objects lists the things of the scene, and \"id:o3\" selects one"
             )))
         };
         let mut found = Found { rows: answers.selection.splats, ..Found::default() };
@@ -130,9 +130,9 @@ impl Editor {
     /// Splats of a thing of `splatvk objects`.
     fn thing(&mut self, id: &str) -> Result<(Vec<usize>, usize)> {
         let places = self.words()?.places();
-        let named = |level: usize, label: String| format!("{}{label}", LEVEL_NAMES[level]) == id;
-        let thing = places.things(0.0).into_iter().find(|thing| named(thing.level, thing.label()));
-        thing.map(|thing| (thing.instance.splats, thing.level)).ok_or_else(|| {
+        let thing = places.things(0.0).into_iter().find(|thing| thing.id() == id);
+        let found = thing.map(|thing| (thing.instance.splats, places.code_level(thing.level)));
+        found.ok_or_else(|| {
             Error::input(format!("\"id:{id}\": the scene has no such thing; splatvk objects lists its ids"))
         })
     }

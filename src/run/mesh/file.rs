@@ -5,11 +5,12 @@ use super::{
 use crate::format::mesh::{self, MeshFile, MeshFormat};
 use crate::format::scene_dir::Scene;
 use crate::progress::Progress;
+use crate::query::things::OBJECTS;
 use crate::run::metric::Distance;
 use crate::run::objects::{self, ObjectOptions};
 use crate::run::outputs::WrittenFile;
 use crate::run::{Machine, stored};
-use crate::scene::{Camera, LEVEL_NAMES, Mesh, World};
+use crate::scene::{Camera, Mesh, World};
 use crate::{Error, Result};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -130,13 +131,12 @@ impl MeshOutput<'_> {
     }
 }
 
-/// The things of a scene as a whole, whose language moves onto the device.
+/// The objects of a scene, whose language moves onto the device.
 fn things(scene: &mut Scene, plan: &MeshPlan, machine: &Machine, progress: &dyn Progress) -> Result<Things> {
     let options = ObjectOptions { vocabulary: plan.vocabulary.clone(), ..ObjectOptions::default() };
     let (_, list) = objects::of_scene(scene, machine, &options, progress)?;
-    let whole = LEVEL_NAMES.len() - 1;
     let mut things = Things { object: vec![0; scene.splats.len()], names: Vec::new() };
-    for object in list.into_iter().filter(|o| o.thing.level == whole) {
+    for object in list.into_iter().filter(|o| o.thing.level == OBJECTS) {
         things.names.push(object.name);
         let number = things.names.len() as u32;
         object.thing.instance.splats.iter().for_each(|i| things.object[*i] = number);

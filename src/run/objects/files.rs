@@ -8,12 +8,13 @@ use crate::format::scene_dir::Scene;
 use crate::format::{picture, write_json};
 use crate::photo::stems_apart;
 use crate::progress::Progress;
+use crate::query::things::{LEVELS, OBJECTS};
 use crate::report::file_name;
 use crate::run::ask::QueryScene;
 use crate::run::export::{Asked, Placement};
 use crate::run::outputs::WrittenFiles;
 use crate::run::stored;
-use crate::scene::{Camera, LEVEL_NAMES, Splats, World};
+use crate::scene::{Camera, Splats, World};
 use crate::{Error, Result};
 use serde_json::{Value, json};
 use std::fmt::Write;
@@ -22,7 +23,7 @@ use std::path::Path;
 /// Settings of the files of things.
 #[derive(Clone, Debug)]
 pub struct ObjectFiles {
-    /// Level of the files, an index of [`LEVEL_NAMES`]; objects.json lists all.
+    /// Level of the files, an index of [`LEVELS`]; objects.json lists all.
     pub level: usize,
     /// Name of the format of the file of each thing.
     pub format: String,
@@ -32,7 +33,7 @@ pub struct ObjectFiles {
 
 impl Default for ObjectFiles {
     fn default() -> Self {
-        ObjectFiles { level: LEVEL_NAMES.len() - 1, format: "ply".to_owned(), raw: false }
+        ObjectFiles { level: OBJECTS, format: "ply".to_owned(), raw: false }
     }
 }
 
@@ -62,7 +63,7 @@ impl ObjectFiles {
     pub fn reserve(&self, folder: &Path, force: bool, inputs: &[&Path]) -> Result<ObjectFolder<'_>> {
         let format = SplatFormat::named(&self.format)
             .ok_or_else(|| Error::input(format!("--format: there is no format {} of splats", self.format)))?;
-        if self.level >= LEVEL_NAMES.len() {
+        if self.level >= LEVELS.len() {
             return Err(Error::input(format!("--level: there is no level {}", self.level)));
         }
         Ok(ObjectFolder { files: self, format, out: WrittenFiles::open(folder, force, inputs)? })
@@ -77,7 +78,7 @@ pub fn record(scene: &Scene, list: &[Object], level: usize) -> Result<Value> {
     let stems = stems(&scene.cameras)?;
     let entries: Vec<Value> = list.iter().map(|o| o.record(list, &stems, &scene.world)).collect();
     Ok(json!({
-        "scene": scene.path, "out": null, "world": scene.world, "level": LEVEL_NAMES[level], "files": null,
+        "scene": scene.path, "out": null, "world": scene.world, "level": LEVELS[level], "files": null,
         "objects": entries,
     }))
 }
@@ -120,7 +121,7 @@ impl ObjectFolder<'_> {
         let level = self.files.level;
         for (object, entry) in list.iter().zip(entries).filter(|(o, _)| o.thing.level == level) {
             progress.check()?;
-            let stem = format!("{}-{}", object.id(), file_name(&object.name));
+            let stem = format!("{}-{}", object.thing.id(), file_name(&object.name));
             let name = format!("{stem}{}", self.format.ending);
             let splats = scene.splats.picked(&object.thing.instance.splats);
             write_as(&self.out.file(&name)?, &splats, None, self.format, WriteOptions::default())?;
@@ -148,8 +149,10 @@ fn write_nodes(path: &Path, scene: &Scene, list: &[Object], level: usize, number
     let mut parts: Vec<Splats> =
         of_level.iter().map(|o| scene.splats.picked(&o.thing.instance.splats)).collect();
     let rest: Vec<usize> = (0..numbers.len()).filter(|i| numbers[*i] == 0).collect();
-    let mut names: Vec<(&str, Value)> =
-        of_level.iter().map(|o| (o.name.as_str(), json!({ "id": o.id(), "named": o.is_named }))).collect();
+    let mut names: Vec<(&str, Value)> = of_level
+        .iter()
+        .map(|o| (o.name.as_str(), json!({ "id": o.thing.id(), "named": o.is_named })))
+        .collect();
     if !rest.is_empty() {
         parts.push(scene.splats.picked(&rest));
         names.push((REST, json!({})));
@@ -169,7 +172,7 @@ fn csv(list: &[Object], world: &World) -> String {
             .to_owned();
     for object in list {
         let instance = &object.thing.instance;
-        let parent = object.thing.parent.and_then(|k| list.get(k)).map(Object::id).unwrap_or_default();
+        let parent = object.thing.parent.and_then(|k| list.get(k)).map(|o| o.thing.id()).unwrap_or_default();
         let (centre, size) = (instance.centre, instance.oriented.size);
         let metres = match &world.scale {
             Some(scale) => (size * scale.metres_per_unit).to_array().map(|v| format!("{v:.4}")).join(","),
@@ -180,9 +183,9 @@ fn csv(list: &[Object], world: &World) -> String {
         let _ = writeln!(
             text,
             "{},{},{},{parent},{},{},{},{:.6},{reliability},{:.5},{:.5},{:.5},{:.5},{:.5},{:.5},{metres}",
-            object.id(),
+            object.thing.id(),
             object.thing.number(),
-            LEVEL_NAMES[object.thing.level],
+            LEVELS[object.thing.level],
             quoted(&object.name),
             object.is_named,
             instance.splats.len(),

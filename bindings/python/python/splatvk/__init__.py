@@ -220,7 +220,7 @@ def objects(
     vocabulary=None,
     min_share=None,
     out=None,
-    level="whole",
+    level="object",
     format="ply",
     raw=False,
     force=False,
@@ -241,8 +241,8 @@ def objects(
     out : path, optional
         Folder for objects.json, objects.csv, a file and a picture per thing, scene.glb and
         scene.ply. Only with `force=True` are files of the same names replaced.
-    level : {"whole", "part", "subpart"}
-        Level of the files.
+    level : {"object", "whole", "part", "subpart"}
+        Level of the files. No splat is in two objects; wholes may join things with their table.
     format : str
         Format of the file of each thing, as of `splatvk objects --format`.
     raw : bool
@@ -254,7 +254,7 @@ def objects(
     Returns
     -------
     list of dict
-        The entries of objects.json: id, level, parent, name, boxes in scene units and in metres.
+        The entries of objects.json: id, level, surface, parent, name, boxes in scene units and in metres.
     """
     options = {
         "vocabulary": vocabulary,

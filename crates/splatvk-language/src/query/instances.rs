@@ -176,7 +176,8 @@ impl Places {
         cells::groups(chosen, cell, points, |i| self.centres[i])
     }
 
-    fn instance(&self, splats: Vec<usize>, share: f64, level: usize) -> Instance {
+    /// An instance of splats, which ascend.
+    pub(super) fn instance(&self, splats: Vec<usize>, share: f64, level: usize) -> Instance {
         let total: f64 = splats.iter().map(|&i| self.weights[i]).sum();
         let mean = splats.iter().map(|&i| self.weights[i] * self.centres[i]).sum::<DVec3>() / total;
         let mut covariance = nalgebra::Matrix3::<f64>::zeros();

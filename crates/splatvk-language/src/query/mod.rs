@@ -6,6 +6,7 @@
 //! of the `field` protocol is chosen on codes, so smoothing never moves its edges.
 mod cells;
 pub mod clicks;
+mod enclosed;
 pub mod filter;
 pub mod frame;
 pub mod highlight;

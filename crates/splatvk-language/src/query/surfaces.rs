@@ -10,6 +10,8 @@ use glam::Vec3;
 const THICKNESS: f32 = 0.015;
 /// Least share of the splats of things that is a surface.
 const LEAST: f64 = 0.08;
+/// Least share of the opacity of the scene of a thing whose splats define surfaces.
+const LEAST_THING: f64 = 0.001;
 /// Share of its splats on a surface from which a thing is a patch of it.
 const PATCH: f64 = 0.7;
 /// Most surfaces.
@@ -57,10 +59,10 @@ impl Plane {
 impl Places {
     /// Per thing the surface that it is a patch of, numbered by their number of splats, largest
     /// first. A thing of several faces, and one that stands out of a surface, is none.
-    pub fn surfaces(&self, things: &[Thing]) -> Vec<Option<usize>> {
+    pub(super) fn surfaces(&self, things: &[Thing]) -> Vec<Option<usize>> {
         let place = |i: &usize| self.centres()[*i].as_vec3();
-        let mut left: Vec<usize> =
-            things.iter().flat_map(|thing| thing.instance.splats.iter().copied()).collect();
+        let large = things.iter().filter(|thing| thing.instance.share >= LEAST_THING);
+        let mut left: Vec<usize> = large.flat_map(|thing| thing.instance.splats.iter().copied()).collect();
         left.sort_unstable();
         left.dedup();
         let all = left.len();
@@ -94,6 +96,7 @@ impl Places {
 
 #[cfg(test)]
 mod tests {
+    use super::super::things::OBJECTS;
     use super::*;
     use crate::scene::{Codebook, LanguageField, LevelField, Splats};
 
@@ -138,13 +141,21 @@ mod tests {
             sh: vec![0.0; 3 * count],
             ..Splats::default()
         };
-        let places = Places::of(&splats, &LanguageField { levels: vec![level], space: String::new() });
-        let things = places.things(0.001);
-        let codes: Vec<usize> = things.iter().map(|thing| thing.code).collect();
-        assert_eq!(
-            (codes, places.surfaces(&things)),
-            (vec![0, 1, 2, 3], vec![Some(0), Some(0), Some(1), None])
+        let places = Places::of(
+            &splats,
+            &LanguageField { levels: vec![LevelField::default(), level], space: String::new() },
         );
+        let things = places.things(0.001);
+        let of_level = |level: usize| things.iter().filter(move |thing| thing.level == level);
+        let objects: Vec<_> =
+            of_level(OBJECTS).map(|o| (o.id(), o.is_surface, o.instance.splats.len())).collect();
+        let expected = [("o1", true, 3600), ("o3", true, 1800), ("o4", false, 1000)];
+        assert_eq!(objects, expected.map(|(id, is_surface, splats)| (id.to_owned(), is_surface, splats)));
+        let shares: f64 = of_level(OBJECTS).map(|o| o.instance.share).sum();
+        assert!((shares - 1.0).abs() < 1e-9, "{shares}");
+        // The second patch of the table is a part of the first object.
+        let parents: Vec<usize> = of_level(1).filter_map(|part| part.parent).collect();
+        assert_eq!(parents, [0, 0, 1, 2]);
         assert!(places.surfaces(&[]).is_empty());
     }
 }

@@ -1,17 +1,27 @@
-//! The things of a scene, without a text: connected groups of the splats of every code, on every
-//! level.
+//! The things of a scene, without a text: connected groups of the splats of every code on every
+//! level, and the objects that their parts make (docs/use/objects.md).
 use super::instances::{Instance, Places};
+use crate::scene::LEVEL_NAMES;
 use std::collections::BTreeMap;
 
+/// Level of objects, beside those of codes. No splat is in two of them.
+pub const OBJECTS: usize = LEVEL_NAMES.len();
+/// Names of the levels of things, in the order of their index.
+pub const LEVELS: [&str; OBJECTS + 1] = ["s", "m", "l", "o"];
+/// All levels, coarsest first.
+const COARSEST_FIRST: [usize; LEVELS.len()] = [2, OBJECTS, 1, 0];
+/// Levels whose things can be objects, best first: masks of parts separate things, those of wholes
+/// join them with their table.
+const OBJECT_LEVELS: [usize; LEVEL_NAMES.len()] = [1, 2, 0];
 /// Index of no thing.
 const NONE: u32 = u32::MAX;
 
 /// A thing.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Thing {
-    /// Level, index as in [`crate::scene::LEVEL_NAMES`].
+    /// Level, index of [`LEVELS`].
     pub level: usize,
-    /// Its code of the level.
+    /// Its code of the level; for an object that of its first part.
     pub code: usize,
     /// Index among the groups of the code, heaviest first.
     pub group: usize,
@@ -19,6 +29,8 @@ pub struct Thing {
     pub instance: Instance,
     /// Index of the thing of a coarser level that contains most of it.
     pub parent: Option<usize>,
+    /// Whether it is an object whose parts lie on one large plane, such as a table or a wall.
+    pub is_surface: bool,
 }
 
 impl Thing {
@@ -35,43 +47,108 @@ impl Thing {
             group => format!("{}.{}", self.code + 1, group + 1),
         }
     }
+
+    /// Identifier, unique in the scene: level and label, "o3" or "l3.2".
+    pub fn id(&self) -> String {
+        format!("{}{}", LEVELS[self.level], self.label())
+    }
 }
 
 impl Places {
     /// Things with at least `least_share` of the opacity of the scene: coarsest level first, on each
     /// level in the order of their codes. No splat is in two things of a level.
     pub fn things(&self, least_share: f64) -> Vec<Thing> {
-        let all: f64 = self.weights().iter().sum();
+        let mut lists: Vec<Vec<Thing>> =
+            (0..LEVEL_NAMES.len()).map(|level| self.groups_of_codes(level)).collect();
+        lists.push(self.objects_of(&lists[self.code_level(OBJECTS)]));
         let mut things: Vec<Thing> = Vec::new();
         // Per coarser level the index of the thing of every splat.
         let mut owners: Vec<Vec<u32>> = Vec::new();
-        for (level, lists) in self.lists().iter().enumerate().rev() {
+        for level in COARSEST_FIRST {
             let mut owner = vec![NONE; self.weights().len()];
-            for code in 0..lists.counts().count() {
-                let splats = lists.splats_of(std::iter::once(code));
-                for (group, mut instance) in self.instances(&splats, level).into_iter().enumerate() {
-                    let weight: f64 = instance.splats.iter().map(|i| self.weights()[*i]).sum();
-                    instance.share = weight / all;
-                    if instance.share < least_share {
-                        continue;
-                    }
-                    let parent = owners.iter().rev().find_map(|o| self.container(&instance, weight, o));
-                    instance.splats.iter().for_each(|i| owner[*i] = things.len() as u32);
-                    things.push(Thing { level, code, group, instance, parent });
-                }
+            let list = std::mem::take(&mut lists[level]).into_iter();
+            for mut thing in list.filter(|thing| thing.instance.share >= least_share) {
+                thing.parent = owners.iter().rev().find_map(|o| self.container(&thing.instance, o));
+                thing.instance.splats.iter().for_each(|i| owner[*i] = things.len() as u32);
+                things.push(thing);
             }
             owners.push(owner);
         }
         things
     }
 
+    /// The objects, in the order of the codes of their first parts: every group of a code, with those
+    /// on the same surface or inside of it.
+    pub fn objects(&self) -> Vec<Thing> {
+        self.objects_of(&self.groups_of_codes(self.code_level(OBJECTS)))
+    }
+
+    fn objects_of(&self, parts: &[Thing]) -> Vec<Thing> {
+        let surfaces = self.surfaces(parts);
+        let enclosing = self.enclosing(parts, |part| surfaces[part].is_some());
+        let mut members: BTreeMap<(Option<usize>, usize), Vec<usize>> = BTreeMap::new();
+        for (part, surface) in surfaces.into_iter().enumerate() {
+            let owner = if surface.is_some() { 0 } else { enclosing[part] };
+            members.entry((surface, owner)).or_default().push(part);
+        }
+        let joined = |((surface, _), members): ((Option<usize>, usize), Vec<usize>)| {
+            let mut object =
+                Thing { level: OBJECTS, is_surface: surface.is_some(), ..parts[members[0]].clone() };
+            if members.len() > 1 {
+                let mut splats =
+                    members.iter().flat_map(|part| parts[*part].instance.splats.clone()).collect::<Vec<_>>();
+                splats.sort_unstable();
+                let share = self.weight(&splats) / self.weight_of_all();
+                object.instance = self.instance(splats, share, self.code_level(OBJECTS));
+            }
+            object
+        };
+        let mut objects: Vec<Thing> = members.into_iter().map(joined).collect();
+        objects.sort_by_key(|object| (object.code, object.group));
+        objects
+    }
+
+    /// Level of the codes of the things of a level.
+    pub fn code_level(&self, level: usize) -> usize {
+        let has_codes =
+            |level: &usize| self.lists().get(*level).is_some_and(|list| list.counts().count() > 0);
+        match level {
+            OBJECTS => OBJECT_LEVELS.into_iter().find(has_codes).unwrap_or(0),
+            own => own,
+        }
+    }
+
+    /// Connected groups of the splats of every code of a level.
+    fn groups_of_codes(&self, level: usize) -> Vec<Thing> {
+        let (Some(lists), all) = (self.lists().get(level), self.weight_of_all()) else { return Vec::new() };
+        let of_code = |code: usize| {
+            let splats = lists.splats_of(std::iter::once(code));
+            let groups = self.instances(&splats, level).into_iter().enumerate();
+            groups.map(move |(group, mut instance)| {
+                instance.share = self.weight(&instance.splats) / all;
+                Thing { level, code, group, instance, ..Thing::default() }
+            })
+        };
+        (0..lists.counts().count()).flat_map(of_code).collect()
+    }
+
+    /// Summed opacity of splats.
+    fn weight(&self, splats: &[usize]) -> f64 {
+        splats.iter().map(|i| self.weights()[*i]).sum()
+    }
+
+    fn weight_of_all(&self) -> f64 {
+        self.weights().iter().sum()
+    }
+
     /// Thing that contains more than half of the weight of an instance.
-    fn container(&self, instance: &Instance, weight: f64, owner: &[u32]) -> Option<usize> {
+    fn container(&self, instance: &Instance, owner: &[u32]) -> Option<usize> {
         let mut shares: BTreeMap<u32, f64> = BTreeMap::new();
         for splat in &instance.splats {
             *shares.entry(owner[*splat]).or_default() += self.weights()[*splat];
         }
-        let most = shares.into_iter().find(|(thing, share)| *thing != NONE && 2.0 * share > weight);
+        let half = 0.5 * self.weight(&instance.splats);
+        let most = shares.into_iter().find(|(thing, share)| *thing != NONE && *share > half);
         most.map(|(thing, _)| thing as usize)
     }
 }
@@ -133,17 +210,18 @@ mod tests {
         let listed: Vec<_> =
             things.iter().map(|t| (t.level, t.number(), t.instance.splats.len(), t.parent)).collect();
         // Of the part level, code 1 is the rest: the second half of the first cup is too small
-        // beside the table, of which it is no part.
+        // beside the table, of which it is no part. All lie on one plane, so that they are one object.
         assert_eq!(
             listed,
             [
                 (2, 1, 20, None),
                 (2, 65537, 20, None),
                 (2, 2, 60, None),
-                (1, 1, 10, Some(0)),
-                (1, 2, 60, Some(2)),
-                (1, 65538, 20, Some(1)),
-                (1, 131074, 10, Some(0))
+                (3, 1, 100, Some(2)),
+                (1, 1, 10, Some(3)),
+                (1, 2, 60, Some(3)),
+                (1, 65538, 20, Some(3)),
+                (1, 131074, 10, Some(3))
             ]
         );
         let share = things[2].instance.share;
