@@ -93,7 +93,7 @@ fn check_selection(page: &mut Page) {
         }
         page.click(x, y);
         let selected = page.run("splatvk.state.selected");
-        assert_eq!(selected, json!({ "level": 2, "codes": [object - 1] }), "at {x}, {y}");
+        assert_eq!(selected, json!({ "level": 3, "codes": [object - 1] }), "at {x}, {y}");
         let name = truth()["labels"][object.to_string()].clone();
         assert_eq!(page.run("document.querySelector('.v-card h3').textContent"), name);
         clicked += 1;
@@ -138,7 +138,7 @@ fn check_query(page: &mut Page) {
 fn check_keyboard(page: &mut Page) {
     page.press("Escape");
     assert_eq!(page.run("splatvk.state.mode"), "colour");
-    for mode in ["depth", "level", "level", "colour"] {
+    for mode in ["depth", "level", "level", "level", "colour"] {
         page.press("m");
         assert_eq!(page.run("splatvk.state.mode"), mode);
     }

@@ -144,8 +144,8 @@ fn marked(page: &mut Page, bit: u32) -> u64 {
 fn selections_are_combined_hidden_and_changed() {
     // The panel leaves room beside it.
     const WIDE: f64 = 1.5;
-    const CHOSEN: u32 = 8;
-    const HIDDEN: u32 = 16;
+    const CHOSEN: u32 = 16;
+    const HIDDEN: u32 = 32;
     let folder = tempfile::tempdir().unwrap();
     let scene = breakfast(folder.path());
     let Some(chromium) = browser::installed() else { return };
@@ -160,23 +160,23 @@ fn selections_are_combined_hidden_and_changed() {
     let small = marked(&mut page, CHOSEN);
     // Twice the side, four times the splats of a surface; a new selection takes the old one's place.
     page.draw(&corners(50.0));
-    page.wait_for(&format!("splatvk.marks().filter((m) => m & 8).length > {}", 2 * small));
+    page.wait_for(&format!("splatvk.marks().filter((m) => m & 16).length > {}", 2 * small));
     let large = marked(&mut page, CHOSEN);
     press_button(&mut page, "Remove");
     page.draw(&corners(25.0));
-    page.wait_for(&format!("splatvk.marks().filter((m) => m & 8).length < {large}"));
+    page.wait_for(&format!("splatvk.marks().filter((m) => m & 16).length < {large}"));
     assert_eq!(marked(&mut page, CHOSEN), large - small);
     press_button(&mut page, "Lasso");
     press_button(&mut page, "Add");
     let round: Vec<[f64; 2]> =
         (0..40).map(|k| 0.16 * f64::from(k)).map(|a| [x + 35.0 * a.cos(), y + 35.0 * a.sin()]).collect();
     page.draw(&round);
-    page.wait_for(&format!("splatvk.marks().filter((m) => m & 8).length === {large}"));
+    page.wait_for(&format!("splatvk.marks().filter((m) => m & 16).length === {large}"));
 
     press_button(&mut page, "Hide");
     assert_eq!((marked(&mut page, CHOSEN), marked(&mut page, HIDDEN)), (0, large));
     press_undo(&mut page, false);
-    page.wait_for(&format!("splatvk.marks().filter((m) => m & 8).length === {large}"));
+    page.wait_for(&format!("splatvk.marks().filter((m) => m & 16).length === {large}"));
     press_button(&mut page, "Recolour");
     wait_for_edits(&mut page, 1);
     page.enter("Words, an id or a range", "id:l9");

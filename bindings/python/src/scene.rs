@@ -11,7 +11,7 @@ use serde_json::{Map, Value};
 use splatvk::format::scene_dir;
 use splatvk::infer::Registry;
 use splatvk::photo;
-use splatvk::query::instances::splat_codes;
+use splatvk::query::instances::{Places, splat_codes};
 use splatvk::run::live::LiveScene;
 use splatvk::run::{self, Extras, RunPlan};
 use splatvk::scene::{LEVEL_NAMES, RgbImage};
@@ -32,6 +32,7 @@ pub struct Scene {
     opacities: OnceLock<Vec<f32>>,
     seen: OnceLock<Vec<bool>>,
     codes: OnceLock<Vec<i32>>,
+    things: OnceLock<Vec<i32>>,
 }
 
 impl Scene {
@@ -45,6 +46,7 @@ impl Scene {
             opacities: OnceLock::new(),
             seen: OnceLock::new(),
             codes: OnceLock::new(),
+            things: OnceLock::new(),
         }
     }
 
@@ -180,7 +182,7 @@ impl Scene {
             |live| (0..live.splats().len()).map(|i| !live.seen().is_unseen(i)).collect(),
         )
     }
-    /// (N, 3) int32, the code of each splat as a subpart, a part and a thing (levels "s", "m", "l");
+    /// (N, 3) int32, the code of each splat as a subpart, a part and a whole (levels "s", "m", "l");
     /// -1 without one.
     #[getter]
     fn codes<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
@@ -198,6 +200,25 @@ impl Scene {
                             *place = code;
                         }
                     }
+                }
+                codes
+            },
+        )
+    }
+    /// (N,) int32, per splat the code of its thing, that of the thing's largest part; -1 without one.
+    #[getter]
+    fn things<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        Self::kept(
+            this,
+            |s| &s.things,
+            &[],
+            |live| {
+                let mut codes = vec![-1; live.splats().len()];
+                let field = live.language();
+                let objects = field.map(|field| Places::of(live.splats(), field).objects());
+                for object in objects.unwrap_or_default() {
+                    let code = i32::try_from(object.code).unwrap_or(-1);
+                    object.instance.splats.iter().for_each(|i| codes[*i] = code);
                 }
                 codes
             },

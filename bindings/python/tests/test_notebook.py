@@ -60,6 +60,9 @@ def test_widget_brings_the_selection_back(scene):
     widget = scene.widget()
     assert not widget.mask.any()
     code = int(scene.codes[:, 2].max())
+    thing = int(scene.things.max())
+    widget.selection = {"selected": {"level": 3, "codes": [thing]}}
+    assert widget.mask.any() and (widget.mask == (scene.things == thing)).all()
     widget.selection = {"selected": {"level": 2, "codes": [code]}, "text": "mug"}
     assert widget.text == "mug"
     assert 0 < len(scene[widget.mask]) == (scene.codes[:, 2] == code).sum()

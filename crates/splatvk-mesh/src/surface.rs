@@ -2,6 +2,10 @@
 use glam::Vec3;
 use std::collections::HashMap;
 
+/// Area of an island from which it belongs to its label, relative to the largest island of the
+/// label: behind the silhouette of a thing, a few triangles in the air have its label.
+const CRUMB: f64 = 0.02;
+
 /// Triangles whose vertices have a linear colour and a label.
 #[derive(Clone, Debug, Default)]
 pub struct Surface {
@@ -68,7 +72,7 @@ impl Surface {
     }
 
     /// Label of every triangle: that of most of its vertices, after islands of less than `least`
-    /// square units got the label around them.
+    /// square units, and crumbs of a label, got the label around them. Crumbs in the air get none.
     pub fn triangle_labels(&self, least: f64) -> Vec<u32> {
         let majority = |t: &[u32; 3]| {
             let [a, b, c] = t.map(|v| self.labels[v as usize]);
@@ -95,10 +99,17 @@ impl Surface {
         for (t, triangle) in self.triangles.iter().enumerate() {
             areas[island[t] as usize] += self.area(*triangle);
         }
+        let mut largest: HashMap<u32, f64> = HashMap::new();
+        for (t, area) in areas.iter().enumerate() {
+            let most = largest.entry(labels[t]).or_default();
+            *most = most.max(*area);
+        }
+        let is_crumb = |t: u32| areas[t as usize] < CRUMB * largest[&labels[t as usize]];
+        let is_small = |t: u32| areas[t as usize] < least || is_crumb(t);
         let mut touched: HashMap<(u32, u32), usize> = HashMap::new();
         for [a, b] in edges {
             for [own, other] in [[a, b], [b, a]].map(|pair| pair.map(|t| island[t as usize])) {
-                if own != other && areas[own as usize] < least && areas[other as usize] >= least {
+                if own != other && is_small(own) && !is_small(other) {
                     *touched.entry((own, labels[other as usize])).or_default() += 1;
                 }
             }
@@ -112,11 +123,13 @@ impl Surface {
                 *entry = (count, label);
             }
         }
-        for (label, island) in labels.iter_mut().zip(island) {
-            if let Some((_, around)) = best.get(&island) {
-                *label = *around;
-            }
-        }
+        let joined = island.iter().zip(&*labels).map(|(own, label)| match best.get(own) {
+            Some((_, around)) => *around,
+            None if is_crumb(*own) => 0,
+            None => *label,
+        });
+        let joined: Vec<u32> = joined.collect();
+        labels.copy_from_slice(&joined);
     }
 
     /// Number of edges with one triangle only: the borders of holes.
@@ -227,6 +240,18 @@ mod tests {
         };
         assert_eq!(area(9), 0.0);
         assert!((area(1) - 210.0).abs() <= 20.0 && (area(2) - 190.0).abs() <= 20.0);
+        // A crumb of a large label joins, however small the least area is; alone it has no label.
+        let mut s = grid(20, |x, y| if (6..8).contains(&x) && y < 2 { 2 } else { 1 + u32::from(x > 10) });
+        let first = s.positions.len() as u32;
+        s.positions.extend([Vec3::X, Vec3::Y, Vec3::ZERO].map(|p| p + 100.0));
+        s.colours.extend([Vec3::ONE; 3]);
+        s.labels.extend([2; 3]);
+        s.triangles.push([first, first + 1, first + 2]);
+        let labels = s.triangle_labels(0.0);
+        assert_eq!(labels.iter().filter(|label| **label == 0).count(), 1);
+        assert_eq!(labels.last(), Some(&0));
+        let at = |x: usize, y: usize| labels[2 * (20 * y + x)];
+        assert_eq!([at(6, 0), at(3, 3), at(15, 3)], [1, 1, 2]);
         assert!(grid(4, |_, _| 0).triangle_labels(12.0).iter().all(|l| *l == 0));
     }
 }

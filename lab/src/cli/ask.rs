@@ -8,7 +8,6 @@ use splatvk::cli::print::{print, print_json};
 use splatvk::cli::{progress, scene};
 use splatvk::gpu;
 use splatvk::query::QueryOptions;
-use splatvk::query::clicks::Standing;
 use splatvk::run::ask::QueryScene;
 use splatvk::run::encoder;
 use std::fmt::Write;
@@ -23,12 +22,11 @@ pub fn ask(args: &AskArgs) -> Result<()> {
             args.scene.display()
         ))
     })?;
-    let standing = Standing::of(&scene.splats, &field, &scene.cameras);
     let device = gpu::open(args.device.device.as_deref())?;
     let mut ready = QueryScene::open(&device, (&scene.splats, &scene.cameras), field, encoder)?;
     let asked = photographs.ask(&mut ready, &QueryOptions::default())?;
     let named = photographs.names(&mut ready)?;
-    let clicked = photographs.clicks(&ready, &standing)?;
+    let clicked = photographs.clicks(&ready)?;
     ready.encoder().embedding_warning().iter().for_each(|warning| progress::print_warning(warning));
     if args.device.json {
         let counts = KINDS.map(|kind| json!({ "kind": kind, "counts": Counts::of(&asked, kind) }));

@@ -11,12 +11,11 @@ use splatvk::cli::scene;
 use splatvk::eval::{GroundTruth, Split};
 use splatvk::format::scene_dir::Scene;
 use splatvk::gpu::{self, Device};
-use splatvk::query::clicks::Standing;
-use splatvk::query::instances::{Places, splat_codes};
-use splatvk::query::things::{OBJECTS, numbers};
+use splatvk::query::instances::Places;
+use splatvk::query::things::{LEVELS, numbers};
 use splatvk::run::objects::LEAST_SHARE;
 use splatvk::run::view::BlendedValues;
-use splatvk::scene::{Camera, Image, LEVEL_NAMES};
+use splatvk::scene::{Camera, Image};
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -35,11 +34,11 @@ pub fn object_accuracy(args: &ObjectAccuracyArgs) -> Result<()> {
     }
     let device = gpu::open(args.device.device.as_deref())?;
     // Per partition all segments and small ones.
-    let mut scores = vec![[Panoptic::default(); 2]; LEVEL_NAMES.len() + 2];
+    let mut scores = vec![[Panoptic::default(); 2]; LEVELS.len()];
     for (scene, truth) in args.scenes.iter().zip(&args.ground_truth) {
         add(scene, truth, &device, &mut scores)?;
     }
-    let levels = LEVEL_NAMES.iter().chain([&"click", &"object"]).zip(&scores);
+    let levels = LEVELS.iter().zip(&scores);
     if args.device.json {
         let figures = |score: &Panoptic| {
             json!({
@@ -93,25 +92,13 @@ fn add(path: &Path, folder: &Path, device: &Device, scores: &mut [[Panoptic; 2]]
     Ok(())
 }
 
-/// Per level, and for the things that a click selects, the thing of every splat, 0 = none.
+/// Per level of things the thing of every splat, 0 = none.
 fn partitions(scene: &Scene) -> Result<Vec<Vec<u32>>> {
     let field = scene.language.as_ref().ok_or_else(|| Error::input("the scene has no language"))?;
     let count = scene.splats.len();
     let places = Places::of(&scene.splats, field);
     let all = places.things(LEAST_SHARE);
-    let mut partitions: Vec<Vec<u32>> =
-        (0..LEVEL_NAMES.len()).map(|level| numbers(all.iter(), level, count)).collect();
-    let codes: Vec<_> = field.levels.iter().map(splat_codes).collect();
-    let standing = Standing::of(&scene.splats, field, &scene.cameras);
-    let whole = |i: usize| {
-        let own: Vec<Option<usize>> = codes.iter().map(|level| level.get(i).copied().flatten()).collect();
-        let level = standing.level_of(&own)?;
-        let number = partitions[level][i];
-        (number > 0).then_some(number + ((level as u32) << 28))
-    };
-    partitions.push((0..count).map(|i| whole(i).unwrap_or(0)).collect());
-    partitions.push(numbers(all.iter(), OBJECTS, count));
-    Ok(partitions)
+    Ok((0..LEVELS.len()).map(|level| numbers(all.iter(), level, count)).collect())
 }
 
 /// Per view the owner of most of every pixel, 0 = none.

@@ -7,9 +7,10 @@ use serde::{Deserialize, Serialize};
 use splatvk::infer::words;
 use splatvk::photo::stem;
 use splatvk::query::QueryOptions;
-use splatvk::query::clicks::Standing;
+use splatvk::query::instances::Places;
 use splatvk::query::maps::{LevelMap, VOID};
 use splatvk::query::presence::Presence;
+use splatvk::query::things::OBJECTS;
 use splatvk::run::answer::Answers;
 use splatvk::run::ask::QueryScene;
 use splatvk::scene::{Camera, Image};
@@ -200,8 +201,10 @@ pub struct Clicked {
 
 impl Photographs {
     /// Selections by clicks on the labelled things, in the photos of the last [`Photographs::ask`].
-    pub fn clicks(&self, scene: &QueryScene, standing: &Standing) -> Result<Vec<Clicked>> {
+    pub fn clicks(&self, scene: &QueryScene) -> Result<Vec<Clicked>> {
         let mut clicked = Vec::new();
+        let level = scene.places().code_level(OBJECTS);
+        let things = things_of_codes(scene.places(), level);
         for ((_, targets), frame) in self.frames.iter().zip(scene.frames()) {
             let maps = &frame.maps;
             for (category, target) in targets {
@@ -220,16 +223,32 @@ impl Photographs {
                 };
                 let levels = (0..codes.len()).filter(|level| codes[*level].is_some());
                 let all = levels.map(iou).collect::<Result<Vec<f64>>>()?;
-                let chosen = standing.level_of(&codes);
+                let own = codes[level].and_then(|code| things[code]);
+                let of_thing = |code: &u16| own.is_some() && things.get(usize::from(*code)) == Some(&own);
+                let data = maps.levels[level].codes.iter().map(of_thing).collect();
+                let thing = Image { width: maps.width, height: maps.height, data };
                 clicked.push(Clicked {
                     category: category.clone(),
-                    iou: chosen.map(iou).transpose()?.unwrap_or(0.0),
+                    iou: mask_iou(&thing, truth)?,
                     best: all.into_iter().fold(0.0, f64::max),
                 });
             }
         }
         Ok(clicked)
     }
+}
+
+/// Per code of a level the object of its heaviest group.
+fn things_of_codes(places: &Places, level: usize) -> Vec<Option<usize>> {
+    let mut owner = vec![None; places.weights().len()];
+    for (k, object) in places.objects().iter().enumerate() {
+        object.instance.splats.iter().for_each(|i| owner[*i] = Some(k));
+    }
+    let of_code = |code: usize| {
+        let splats = places.lists()[level].splats_of(std::iter::once(code));
+        places.instances(&splats, level).first().and_then(|group| owner[*group.splats.first()?])
+    };
+    (0..places.lists()[level].counts().count()).map(of_code).collect()
 }
 
 /// The pixel of a mask that is farthest from its border, by rows and columns.

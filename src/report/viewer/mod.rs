@@ -13,10 +13,10 @@ use crate::Result;
 use crate::format::picture;
 use crate::format::scene_dir::Scene;
 use crate::format::views::Views;
-use crate::query::clicks::Standing;
 use crate::query::highlight::Highlight;
 use crate::query::presence::Presence;
-use crate::scene::{Camera, LEVEL_NAMES, LanguageField, RgbImage, World};
+use crate::query::things::{self, LEVELS};
+use crate::scene::{Camera, LanguageField, RgbImage, World};
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
@@ -263,8 +263,6 @@ impl Scene3d<'_> {
 
     fn manifest(&self, ask_note: &str) -> Result<Value> {
         let views = self.cameras.iter().enumerate().map(|(i, c)| view(c, self.photos.get(i).copied()));
-        let standing =
-            self.language.map(|l| Standing::of(self.layers.splats, l, self.cameras)).unwrap_or_default();
         let words = self.language.is_some_and(|l| l.space.starts_with("words"));
         Ok(json!({
             "title": self.title, "live": false, "ask_note": ask_note,
@@ -273,21 +271,24 @@ impl Scene3d<'_> {
             "unseen": self.layers.seen.unseen() + self.layers.backdrop.len(),
             "metres": self.world.scale.as_ref().map(|s| s.metres_per_unit),
             "up": self.world.up.as_ref().map(|u| u.direction.to_array()),
-            "levels": (0..LEVEL_NAMES.len()).map(|at| self.level(at, &standing)).collect::<Vec<_>>(),
+            "levels": (0..LEVELS.len()).map(|at| self.level(at)).collect::<Vec<_>>(),
             "suggested": self.suggested, "named": self.named,
             "answers": self.answers.iter().map(ShownAnswer::json).collect::<Vec<_>>(),
         }))
     }
 
-    fn level(&self, at: usize, standing: &Standing) -> Value {
-        let codes = self.language.and_then(|l| l.levels.get(at)).map_or(0, |l| l.codebook.len());
-        let colours: Vec<[f32; 3]> = (0..codes).map(|k| colour::label(k as i32)).collect();
-        let (title, one) = [("Subparts", "Subpart"), ("Parts", "Part"), ("Things", "Thing")][at];
-        let phrases = self.names.get(at).filter(|n| n.len() == codes).cloned().unwrap_or_default();
-        let pairs = standing.pairs().get(at).map_or(&[][..], Vec::as_slice);
+    /// Level of things of the page; `codes` is that of its codes.
+    fn level(&self, at: usize) -> Value {
+        let sizes = self.language.map_or(Vec::new(), |l| l.levels.iter().map(|l| l.codebook.len()).collect());
+        let of_codes = things::code_level(at, &sizes);
+        let count = sizes.get(of_codes).copied().unwrap_or(0);
+        let colours: Vec<[f32; 3]> = (0..count).map(|k| colour::label(k as i32)).collect();
+        let (title, one) =
+            [("Subparts", "Subpart"), ("Parts", "Part"), ("Wholes", "Whole"), ("Things", "Thing")][at];
+        let phrases = self.names.get(of_codes).filter(|n| n.len() == count).cloned().unwrap_or_default();
         json!({
-            "name": LEVEL_NAMES[at], "title": title, "one": one, "colours": colours, "phrases": phrases,
-            "standing": pairs,
+            "name": LEVELS[at], "title": title, "one": one, "colours": colours, "phrases": phrases,
+            "codes": of_codes,
         })
     }
 }

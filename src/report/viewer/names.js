@@ -11,7 +11,7 @@ const noun = ([phrase]) => phrase.slice(phrase.lastIndexOf(" ") + 1);
 /// phrase fits no better than "object" or "stuff".
 export function namesOf(levels, answers, level, code) {
   const all = new Map(levels[level].phrases[code] || []);
-  answers.forEach((a) => all.set(a.text, a.relevancy[level][code]));
+  answers.forEach((a) => all.set(a.text, a.relevancy[levels[level].codes][code]));
   return [...all].filter((name) => name[1] > 0.51).sort((a, b) => b[1] - a[1]).slice(0, 6);
 }
 

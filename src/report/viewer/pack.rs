@@ -1,7 +1,7 @@
 //! Compact splats for the page: quantised, in spatial order, deflated.
 //!
-//! Little endian, after gzip; N splats, B = ⌈N / 256⌉ blocks, L language levels, R = (degree + 1)²
-//! − 1:
+//! Little endian, after gzip; N splats, B = ⌈N / 256⌉ blocks, L levels of things, none without
+//! language, R = (degree + 1)² − 1:
 //!
 //! | field | type | meaning |
 //! |---|---|---|
@@ -14,15 +14,16 @@
 //! | opacity | u8 × N | 0 to 1 |
 //! | red, green, blue | u8 × N each | 0.5 + SH₀ · DC in the block's range |
 //! | SH rest | i8 × N, 3 R times | coefficient by coefficient, RGB; 127 = the scale of its degree |
-//! | codes | u16 × N, L times | code + 1 per level, finest first; 0 = none |
-//! | kinds | u8 × N | sum of 1: no photo shows it, 2: of a [hole](Layers::holes), 4: of the backdrop |
+//! | codes | u16 × N, L times | code + 1 per level, in the order of [`LEVELS`]; 0 = none |
+//! | kinds | u8 × N | sum of 1: no photo shows it, 2: of a [hole](Layers::holes), 4: of the backdrop, 8: of a surface that carries things |
 //!
 //! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block,
 //! which is a few neighbouring splats wide.
 use crate::format::scene_dir::Scene;
 use crate::math::{quaternion_norm, sigmoid};
-use crate::query::instances;
-use crate::scene::{LanguageField, LevelField, SH_C0, Seen, Splats};
+use crate::query::instances::Places;
+use crate::query::things::{LEVELS, OBJECTS};
+use crate::scene::{LanguageField, SH_C0, Seen, Splats};
 use crate::{Error, Result};
 use rayon::prelude::*;
 
@@ -37,6 +38,7 @@ const MIN_ALPHA: f32 = 1.0 / 255.0;
 const UNSEEN: u8 = 1;
 const HOLE: u8 = 2;
 const BACKDROP: u8 = 4;
+const SURFACE: u8 = 8;
 
 /// Splats of a page, each layer in front of the next.
 #[derive(Clone, Copy, Debug)]
@@ -82,9 +84,10 @@ pub fn pack(layers: Layers, language: Option<&LanguageField>, most: usize) -> Re
         _ => BACKDROP | UNSEEN,
     };
     let order = morton_order(&all, most_visible(&all, most));
-    let levels: Vec<&LevelField> = language.map_or(Vec::new(), |f| f.levels.iter().collect());
-    let kinds: Vec<u8> = order.iter().map(|i| kind(*i)).collect();
-    let raw = write(&all, &kinds, &levels, &order);
+    let (codes, is_surface) = language.map(|field| things(splats, field)).unwrap_or_default();
+    let surface = |i: usize| u8::from(is_surface.get(i).is_some_and(|own| *own)) * SURFACE;
+    let kinds: Vec<u8> = order.iter().map(|i| kind(*i) | surface(*i)).collect();
+    let raw = write(&all, &kinds, &codes, &order);
     Ok(Packed { bytes: gzip(&raw)?, order, total: all.len() })
 }
 
@@ -176,7 +179,7 @@ fn bounds<const K: usize>(rows: impl Iterator<Item = [f32; K]>) -> ([f32; K], [f
     })
 }
 
-fn write(splats: &Splats, kinds: &[u8], levels: &[&LevelField], order: &[usize]) -> Vec<u8> {
+fn write(splats: &Splats, kinds: &[u8], codes: &[Vec<u16>], order: &[usize]) -> Vec<u8> {
     let rest = splats.sh_len() - 1;
     let colour = |i: usize| [0, 1, 2].map(|c| 0.5 + SH_C0 * splats.sh[3 * (rest + 1) * i + c]);
     let all = |i: usize| {
@@ -202,7 +205,7 @@ fn write(splats: &Splats, kinds: &[u8], levels: &[&LevelField], order: &[usize])
     let mut out = MAGIC.to_vec();
     let has_kinds = kinds.iter().any(|kind| *kind != 0);
     let flags = u32::from(has_kinds) | u32::from(splats.antialiased) << 1;
-    for v in [order.len() as u32, splats.sh_degree, levels.len() as u32, flags] {
+    for v in [order.len() as u32, splats.sh_degree, codes.len() as u32, flags] {
         out.extend(v.to_le_bytes());
     }
     scales.iter().chain(ranges.iter().flatten().flatten()).for_each(|v| out.extend(v.to_le_bytes()));
@@ -228,7 +231,8 @@ fn write(splats: &Splats, kinds: &[u8], levels: &[&LevelField], order: &[usize])
                 order.iter().map(|i| (value(i) / scale * 127.0).round() as i8 as u8).collect()
             }
             Plane::Codes(level) => {
-                codes(levels[level], order).iter().flat_map(|code| code.to_le_bytes()).collect()
+                let code = |i: &usize| codes[level].get(*i).copied().unwrap_or(0).to_le_bytes();
+                order.iter().flat_map(code).collect()
             }
             Plane::Kinds => kinds.to_vec(),
         }
@@ -237,7 +241,7 @@ fn write(splats: &Splats, kinds: &[u8], levels: &[&LevelField], order: &[usize])
     planes.extend([Plane::Rotation, Plane::Opacity]);
     planes.extend((0..3).map(Plane::Colour));
     planes.extend((0..rest).flat_map(|k| (0..3).map(move |c| Plane::Rest(k, c))));
-    planes.extend((0..levels.len()).map(Plane::Codes));
+    planes.extend((0..codes.len()).map(Plane::Codes));
     planes.extend(has_kinds.then_some(Plane::Kinds));
     planes.into_par_iter().map(plane).collect::<Vec<_>>().iter().for_each(|plane| out.extend(plane));
     out
@@ -292,18 +296,30 @@ fn packed_rotation(q: [f32; 4]) -> u32 {
     packed
 }
 
-/// Code + 1 of every splat, 0 without a code.
-fn codes(level: &LevelField, order: &[usize]) -> Vec<u16> {
-    let splat_codes = instances::splat_codes(level);
-    let code = |i: &usize| splat_codes.get(*i).copied().flatten().and_then(|k| u16::try_from(k + 1).ok());
-    order.iter().map(|i| code(i).unwrap_or(0)).collect()
+/// Per level of things code + 1 of every splat of the scene, 0 without a code, and whether it is on
+/// a surface that carries things.
+fn things(splats: &Splats, field: &LanguageField) -> (Vec<Vec<u16>>, Vec<bool>) {
+    let places = Places::of(splats, field);
+    let (mut codes, mut is_surface) = (vec![vec![0; splats.len()]; LEVELS.len()], vec![false; splats.len()]);
+    let number = |code: usize| u16::try_from(code + 1).unwrap_or(0);
+    for (level, lists) in places.lists().iter().enumerate().take(OBJECTS) {
+        for code in 0..lists.counts().count() {
+            lists.splats_of(std::iter::once(code)).iter().for_each(|i| codes[level][*i] = number(code));
+        }
+    }
+    for object in places.objects() {
+        for i in object.instance.splats {
+            (codes[OBJECTS][i], is_surface[i]) = (number(object.code), object.is_surface);
+        }
+    }
+    (codes, is_surface)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::Codebook;
     use crate::scene::seeded;
+    use crate::scene::{Codebook, LevelField};
     use std::io::Read;
 
     fn unpacked(packed: &Packed) -> Vec<u8> {

@@ -73,14 +73,6 @@ function alphaAt(i, dx, dy, u, v, z, fx, fy, r, logScales, quats, opacity, antia
 /// Number of splats of a code.
 export const sizeOfCode = (splats, level, code) => splats.codes[level].reduce((n, c) => n + (c === code + 1), 0);
 
-/// Level that a click on a pixel with these codes selects, as in the Rust module `query::clicks`:
-/// the coarsest one whose code has less than a quarter of the splats, is at most six times as large
-/// as the next finer one, and is no surface that carries the thing.
-export function wholeOf(splats, levels, codes) {
-  const sizes = codes.map((code, level) => (code < 0 ? 0 : sizeOfCode(splats, level, code)));
-  const carries = (code, level) => levels[level].standing.some(([on, finer, thing]) => on === code && codes[finer] === thing);
-  const joins = (level) => { const part = sizes.slice(0, level).findLast((n) => n > 0); return part && sizes[level] > 6 * part; };
-  const isWhole = (code, level) => code >= 0 && sizes[level] < splats.count / 4 && !joins(level) && !carries(code, level);
-  const whole = codes.findLastIndex(isWhole);
-  return whole >= 0 ? whole : codes.findLastIndex((code) => code >= 0);
-}
+/// Level that a click on a pixel with these codes selects: that of things, or the coarsest mask
+/// where there is none.
+export const wholeOf = (codes) => codes.findLastIndex((code) => code >= 0);

@@ -28,7 +28,7 @@ const PROJECT = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
 uniform usampler2D data;     // two texels per splat: position, (r, g); (b, opacity), log scales, quaternion
 uniform usampler2D order;    // splats, far to near
-uniform usampler2D codes;    // code + 1 per level
+uniform usampler2D codes;    // code + 1 per level of things
 uniform usampler2D marks;    // MARKS
 uniform sampler2D sh;        // (degree + 1)² − 1 texels per splat, -1..1 of shScale
 uniform sampler2D table;     // per level two rows: (label colour, selected), (relevancy, answers)
@@ -260,7 +260,7 @@ export class Renderer {
     this.upload(splats);
     this.levels = levels;
     this.columns = 1 + Math.max(0, ...levels.map((l) => l.colours.length));
-    this.table = new Float32Array(4 * this.columns * 6);
+    this.table = new Float32Array(8 * this.columns * levels.length);
     levels.forEach((level, l) => [[0.13, 0.13, 0.13], ...level.colours].forEach((c, k) => this.table.set(c, 4 * (2 * l * this.columns + k))));
     this.textures.table = this.texture();
     this.sendTable();
@@ -372,7 +372,7 @@ export class Renderer {
   sendTable() {
     const { gl } = this;
     gl.bindTexture(gl.TEXTURE_2D, this.textures.table);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, this.columns, 6, 0, gl.RGBA, gl.FLOAT, this.table);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, this.columns, 2 * this.levels.length, 0, gl.RGBA, gl.FLOAT, this.table);
   }
 
   /// Marks codes of a level as selected; none with level < 0.
@@ -387,7 +387,7 @@ export class Renderer {
   /// `doubt` is drawn without colours.
   answer(relevancy, level, codes, doubt) {
     this.doubt = doubt;
-    relevancy.forEach((list, at) => list.forEach((v, k) => {
+    this.levels.forEach((l, at) => relevancy[l.codes]?.forEach((v, k) => {
       this.table.set([v, at === level && codes.includes(k) ? 1 : 0], 4 * ((2 * at + 1) * this.columns + k + 1));
     }));
     this.sendTable();

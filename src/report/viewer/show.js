@@ -49,7 +49,7 @@ export function select(level, picked) {
   if (manifest.framed) tellOuter({ selected: { level, codes: [code] } });
   show(state.mode, level);
   const names = namesOf(levels, answers, level, code), size = `${sizeOfCode(scene.splats, level, code).toLocaleString("en")} splats`;
-  const { one } = levels[level], asked = answers.find((a) => isSure(a) && a.level === level && a.codes.includes(code));
+  const { one } = levels[level], asked = answers.find((a) => isSure(a) && a.level === levels[level].codes && a.codes.includes(code));
   if (asked || isClear(names)) card(asked?.text ?? names[0][0], `${one} · ${size}`, { picked, level, names });
   else card(one, names.length ? size : `${size}. ${manifest.names_note}`, { picked, level, doubt: perhaps(names) });
 }

@@ -6,7 +6,7 @@
 let positions = null, marks, keys, order, counts;
 
 /// Bits of `MARKS` in splats.js; a worker imports nothing.
-const HOLE = 2, BACKDROP = 4, HIDDEN = 16;
+const HOLE = 2, BACKDROP = 4, HIDDEN = 32;
 
 self.onmessage = ({ data }) => {
   marks = data.marks ?? marks;

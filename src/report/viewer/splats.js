@@ -1,9 +1,9 @@
 // Reader of the packed scene (format: src/report/viewer/pack.rs).
 const BLOCK = 256;
 
-/// Marks of a splat, bits: no photo shows it, of a hole, of the backdrop; and those of the page: it
-/// is selected, or hidden.
-export const MARKS = { unseen: 1, hole: 2, backdrop: 4, selected: 8, hidden: 16 };
+/// Marks of a splat, bits: no photo shows it, of a hole, of the backdrop, of a surface that carries
+/// things; and those of the page: it is selected, or hidden.
+export const MARKS = { unseen: 1, hole: 2, backdrop: 4, surface: 8, selected: 16, hidden: 32 };
 
 /// Downloads the packed scene; `tell` gets the received share where the server sends the length.
 export async function download(url, tell) {

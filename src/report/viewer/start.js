@@ -87,10 +87,9 @@ function subjectOf({ count, codes, positions, marks }, camera) {
 /// Splats of each thing of its own; none without codes.
 function thingsOf(list, codes) {
   if (!codes) return [];
-  const level = levels.findLastIndex((l) => l.colours.length), things = new Map();
-  const bearing = new Set(levels[level].standing.map(([on]) => on + 1));
+  const things = new Map();
   for (const i of list) {
-    if (!codes[i] || bearing.has(codes[i])) continue;
+    if (!codes[i] || scene.splats.marks[i] & MARKS.surface) continue;
     if (!things.has(codes[i])) things.set(codes[i], []);
     things.get(codes[i]).push(i);
   }

@@ -137,7 +137,7 @@ function tap(x, y, centre) {
   if (tapTool()) return tapTool()(hit && { x, y, point: placeAt(x, y, hit.depth), codes: hit.codes });
   if (tape.active) return hit ? measureAt(x, y, hit.depth) : say("Nothing to measure to there.");
   if (!hit) return clear();
-  const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : wholeOf(scene.splats, levels, hit.codes);
+  const level = state.mode === "level" && hit.codes[state.level] >= 0 ? state.level : wholeOf(hit.codes);
   if (level < 0) return say("Nothing that the scene has words for.");
   setQuery(null);
   select(level, { ...hit, at: { camera: scene.motion.camera.stated(...size()), pixel: [x, y] } });

@@ -16,7 +16,6 @@ use crate::infer::RegionEncoder;
 use crate::pass::renderer::Renderer;
 use crate::progress::Silent;
 use crate::query::QueryOptions;
-use crate::query::clicks::Standing;
 use crate::query::instances::Places;
 use crate::report::viewer::CodeNames;
 use crate::scene::{Camera, Image, LanguageField};
@@ -86,7 +85,6 @@ struct Lookup {
     surface: Option<Renderer>,
     /// The last view of it: outlines follow each other from one camera.
     depth: Option<(Camera, Image<f32>)>,
-    standing: Option<Standing>,
     /// Places of a scene without language.
     places: Option<Places>,
 }

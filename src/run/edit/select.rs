@@ -2,16 +2,15 @@
 use super::complete::completed;
 use super::{Editor, floaters};
 use crate::format::edits::{Combine, Pick, Property, Term};
-use crate::query::clicks::Standing;
-use crate::query::instances::Instance;
+use crate::query::instances::Places;
 use crate::query::presence::Presence;
+use crate::query::things::OBJECTS;
 use crate::query::{MaskRule, QueryOptions};
 use crate::run::Compat;
-use crate::scene::{Camera, LanguageField};
+use crate::scene::Camera;
 use crate::{Error, Result};
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
-use std::collections::HashSet;
 
 /// Number of bins of a histogram.
 const BINS: usize = 48;
@@ -197,7 +196,8 @@ impl Editor {
         Error::input(format!("{}: {reason}", self.scene.path.display()))
     }
 
-    /// Splats of the thing at a pixel: of several things with one code, the nearest.
+    /// Splats of the thing at a pixel, with the level of its codes: of several things with one code,
+    /// the nearest. Without `level` it is the object, or the coarsest mask where there is none.
     fn click(
         &mut self,
         camera: &Camera,
@@ -207,32 +207,22 @@ impl Editor {
         let at = pixel_of(camera, pixel)?;
         let maps = self.words()?.codes(camera)?;
         let codes: Vec<Option<usize>> = maps.iter().map(|map| usize::try_from(map.data[at]).ok()).collect();
-        let Editor { scene, lookup, .. } = self;
-        let field = scene.language.as_ref();
-        let standing = lookup.standing.get_or_insert_with(|| {
-            Standing::of(&scene.splats, field.unwrap_or(&LanguageField::default()), &scene.cameras)
-        });
-        let level = level.or_else(|| standing.level_of(&codes));
-        let found = level.and_then(|level| Some((level, (*codes.get(level)?)?)));
-        let (level, code) = found.ok_or_else(|| {
+        let code_of = |level: usize| Some((level, (*codes.get(self.places().code_level(level))?)?));
+        let levels = level.map_or(vec![OBJECTS, 2, 1, 0], |level| vec![level]);
+        let (level, code) = levels.into_iter().find_map(code_of).ok_or_else(|| {
             let [x, y] = pixel;
             Error::input(format!("{}: there is no thing at pixel {x:.0}, {y:.0}", camera.name))
         })?;
         let depth = f64::from(self.depth(camera)?.data[at]);
         let place = camera.unproject(DVec2::from_array(pixel), depth);
-        let splats = self.places().lists()[level].splats_of(std::iter::once(code));
-        let groups = self.places().instances(&splats, level);
-        let means = &self.scene.splats.means;
-        let distance = |group: &Instance| {
-            let squares = group.splats.iter().map(|i| DVec3::from(means[*i].map(f64::from)));
-            squares.map(|mean| mean.distance_squared(place)).fold(f64::INFINITY, f64::min)
+        let places = self.places();
+        let of_codes = places.code_level(level);
+        let splats = places.lists()[of_codes].splats_of(std::iter::once(code));
+        let things: Vec<Vec<usize>> = match level {
+            OBJECTS => places.objects().into_iter().map(|object| object.instance.splats).collect(),
+            level => places.instances(&splats, level).into_iter().map(|group| group.splats).collect(),
         };
-        let nearest =
-            (0..groups.len()).min_by(|a, b| distance(&groups[*a]).total_cmp(&distance(&groups[*b])));
-        // Specks of the code that are no thing of their own go with the clicked one, as with a word.
-        let others = groups.iter().enumerate().filter(|(k, _)| Some(*k) != nearest);
-        let others: HashSet<usize> = others.flat_map(|(_, group)| group.splats.iter().copied()).collect();
-        Ok((splats.into_iter().filter(|i| !others.contains(i)).collect(), level))
+        Ok((nearest(places, &things, &splats, place, of_codes), of_codes))
     }
 
     /// Splats whose centres lie in an outline.
@@ -259,6 +249,34 @@ impl Editor {
         };
         Ok(shown.into_par_iter().filter(inside).collect())
     }
+}
+
+/// Of `things`, which share no splat, the one with the splat of `splats` that is nearest to a place.
+/// Specks of its codes that are no thing of their own go with it, as with a word.
+fn nearest(
+    places: &Places,
+    things: &[Vec<usize>],
+    splats: &[usize],
+    place: DVec3,
+    of_codes: usize,
+) -> Vec<usize> {
+    let mut owner = vec![None; places.centres().len()];
+    for (thing, splats) in things.iter().enumerate() {
+        splats.iter().for_each(|i| owner[*i] = Some(thing));
+    }
+    let distance = |i: &usize| places.centres()[*i].distance_squared(place);
+    let owned = splats.iter().filter(|i| owner[**i].is_some());
+    let chosen = owned.min_by(|a, b| distance(a).total_cmp(&distance(b))).and_then(|i| owner[*i]);
+    let lists = &places.lists()[of_codes];
+    let mut selected: Vec<usize> = Vec::new();
+    for code in 0..lists.counts().count() {
+        let own = lists.splats_of(std::iter::once(code));
+        if own.iter().any(|i| owner[*i].is_some() && owner[*i] == chosen) {
+            selected.extend(own.into_iter().filter(|i| owner[*i].is_none() || owner[*i] == chosen));
+        }
+    }
+    selected.sort_unstable();
+    selected
 }
 
 /// Share of a mask's bar ([`MaskRule::Codes`]) that grows or shrinks it.

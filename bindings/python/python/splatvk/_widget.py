@@ -69,7 +69,9 @@ def make(scene, height):
             chosen = self.selection.get("selected")
             if not chosen:
                 return np.zeros(len(scene), bool)
-            return np.isin(scene.codes[:, chosen["level"]], chosen["codes"])
+            masks = scene.codes.shape[1]
+            codes = scene.codes[:, chosen["level"]] if chosen["level"] < masks else scene.things
+            return np.isin(codes, chosen["codes"])
 
     def hear(widget, message, _buffers):
         number = message.get("number")

@@ -5,7 +5,6 @@
 //! (docs/internals/method.md#queries). Level and location are chosen on the smoothed map; the mask
 //! of the `field` protocol is chosen on codes, so smoothing never moves its edges.
 mod cells;
-pub mod clicks;
 mod enclosed;
 pub mod filter;
 pub mod frame;

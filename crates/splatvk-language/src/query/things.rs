@@ -21,7 +21,7 @@ const NONE: u32 = u32::MAX;
 pub struct Thing {
     /// Level, index of [`LEVELS`].
     pub level: usize,
-    /// Its code of the level; for an object that of its first part.
+    /// Its code of the level; for an object that of its largest part.
     pub code: usize,
     /// Index among the groups of the code, heaviest first.
     pub group: usize,
@@ -77,8 +77,8 @@ impl Places {
         things
     }
 
-    /// The objects, in the order of the codes of their first parts: every group of a code, with those
-    /// on the same surface or inside of it.
+    /// The objects, in the order of the codes of their largest parts: every group of a code, with
+    /// those on the same surface or inside of it.
     pub fn objects(&self) -> Vec<Thing> {
         self.objects_of(&self.groups_of_codes(self.code_level(OBJECTS)))
     }
@@ -92,30 +92,28 @@ impl Places {
             members.entry((surface, owner)).or_default().push(part);
         }
         let joined = |((surface, _), members): ((Option<usize>, usize), Vec<usize>)| {
+            let share = |part: &usize| parts[*part].instance.share;
+            let largest = members.iter().copied().rev().max_by(|a, b| share(a).total_cmp(&share(b)))?;
             let mut object =
-                Thing { level: OBJECTS, is_surface: surface.is_some(), ..parts[members[0]].clone() };
+                Thing { level: OBJECTS, is_surface: surface.is_some(), ..parts[largest].clone() };
             if members.len() > 1 {
-                let mut splats =
-                    members.iter().flat_map(|part| parts[*part].instance.splats.clone()).collect::<Vec<_>>();
+                let splats = members.iter().flat_map(|part| &parts[*part].instance.splats);
+                let mut splats: Vec<usize> = splats.copied().collect();
                 splats.sort_unstable();
-                let share = self.weight(&splats) / self.weight_of_all();
+                let share = members.iter().map(share).sum();
                 object.instance = self.instance(splats, share, self.code_level(OBJECTS));
             }
-            object
+            Some(object)
         };
-        let mut objects: Vec<Thing> = members.into_iter().map(joined).collect();
+        let mut objects: Vec<Thing> = members.into_iter().filter_map(joined).collect();
         objects.sort_by_key(|object| (object.code, object.group));
         objects
     }
 
     /// Level of the codes of the things of a level.
     pub fn code_level(&self, level: usize) -> usize {
-        let has_codes =
-            |level: &usize| self.lists().get(*level).is_some_and(|list| list.counts().count() > 0);
-        match level {
-            OBJECTS => OBJECT_LEVELS.into_iter().find(has_codes).unwrap_or(0),
-            own => own,
-        }
+        let counts: Vec<usize> = self.lists().iter().map(|list| list.counts().count()).collect();
+        code_level(level, &counts)
     }
 
     /// Connected groups of the splats of every code of a level.
@@ -150,6 +148,15 @@ impl Places {
         let half = 0.5 * self.weight(&instance.splats);
         let most = shares.into_iter().find(|(thing, share)| *thing != NONE && *share > half);
         most.map(|(thing, _)| thing as usize)
+    }
+}
+
+/// Level of the codes of the things of a level, by the number of codes of each level.
+pub fn code_level(level: usize, codes: &[usize]) -> usize {
+    let has_codes = |level: &usize| codes.get(*level).is_some_and(|count| *count > 0);
+    match level {
+        OBJECTS => OBJECT_LEVELS.into_iter().find(has_codes).unwrap_or(0),
+        own => own,
     }
 }
 
