@@ -124,9 +124,7 @@ mod tests {
 
     #[test]
     fn place_error_names_large_overlay() {
-        let truth = testing::train(&testing::folder());
-        let small = |p: &Photo| Photo { fine: None, ..crate::photo::load_at(&p.path, 320).unwrap() };
-        let mut photos: Vec<Photo> = truth.photos[..2].iter().map(small).collect();
+        let mut photos = testing::small_train().photos[..2].to_vec();
         for photo in &mut photos {
             // The overlay covers all but a strip.
             let (width, height) = (photo.image.width, photo.image.height);
@@ -143,10 +141,8 @@ mod tests {
 
     #[test]
     fn place_keeps_more_than_half() {
-        let truth = testing::train(&testing::folder());
-        let small = |p: &Photo| Photo { fine: None, ..crate::photo::load_at(&p.path, 320).unwrap() };
         // Two photos that overlap, and two unrelated ones.
-        let mut photos: Vec<Photo> = truth.photos[..2].iter().map(small).collect();
+        let mut photos = testing::small_train().photos[..2].to_vec();
         let sky = grey(&photos[0]);
         let mut dusk = Photo { stem: "dusk".into(), ..sky.clone() };
         dusk.image.data.iter_mut().for_each(|c| *c = c.map(|v| v - 0.3));

@@ -376,21 +376,18 @@ mod tests {
     use crate::progress::Silent;
     use crate::testing::{self, Truth};
 
-    /// Adds `new` to three photos of breakfast with their true cameras.
-    fn add_photo(new: Photo) -> (Truth, Result<SparseModel, Unregistered>) {
-        let truth = testing::train(&testing::folder());
+    /// Adds `new` to the first three photos of breakfast with their true cameras.
+    fn add_photo(truth: &Truth, new: Photo) -> Result<SparseModel, Unregistered> {
         let known: Vec<Camera> = truth.cameras[..3].to_vec();
         let fitted = [Fitted { agreement: 1.0, ..Fitted::default() }; 3];
         let mut photos = truth.photos[..3].to_vec();
         photos.push(new);
         let known = Known { cameras: &known, fitted: &fitted };
-        let found = with_added(&photos, known, &[], 0, &Silent);
-        (truth, found)
+        with_added(&photos, known, &[], 0, &Silent)
     }
 
-    fn check(new: Photo, focal: f64) -> SparseModel {
-        let (truth, found) = add_photo(new);
-        let model = found.unwrap();
+    fn check(truth: &Truth, new: Photo, focal: f64) -> SparseModel {
+        let model = add_photo(truth, new).unwrap();
         assert_eq!(model.cameras[..3], truth.cameras[..3], "known cameras stay");
         let (is, was) = (&model.cameras[3], &truth.cameras[3]);
         let e = pose_errors(&model.cameras, &truth.cameras, truth.mean_depth);
@@ -416,7 +413,7 @@ mod tests {
     #[test]
     fn with_added_registers_same_camera() {
         let truth = testing::train(&testing::folder());
-        let model = check(truth.photos[3].clone(), truth.cameras[3].fx);
+        let model = check(&truth, truth.photos[3].clone(), truth.cameras[3].fx);
         assert!(model.fitted[3].lens.is_none(), "the scene's lens is none");
         assert_eq!(model.fitted[3].camera, 0);
     }
@@ -455,17 +452,17 @@ mod tests {
         let truth = testing::train(&testing::folder());
         let small = truth.photos[3].image.resized_by_area(480, 360);
         let new = crate::photo::from_pixels("other.png".as_ref(), &small, None, 480).unwrap();
-        let error = add_photo(new).1.err().unwrap().error.to_string();
+        let error = add_photo(&truth, new).err().unwrap().error.to_string();
         assert!(error.starts_with("other: by its file taken with another camera"), "{error}");
     }
 
     #[test]
     fn with_added_refuses_unrelated_and_duplicate() {
-        let truth = testing::train(&testing::folder());
+        let truth = testing::small_train();
         let mut sky = truth.photos[3].clone();
         sky.stem = "sky".into();
         sky.image.data.iter_mut().enumerate().for_each(|(i, c)| *c = [0.4, 0.6, 0.5 + 1e-7 * i as f32]);
-        let error = add_photo(sky).1.err().unwrap();
+        let error = add_photo(&truth, sky).err().unwrap();
         assert_eq!(error.views, [(3, Reason::NoOverlap)]);
         assert!(
             error.error.to_string().contains("sky (no photo of the scene shows the same)"),
@@ -473,7 +470,7 @@ mod tests {
             error.error
         );
         let again = Photo { stem: "again".into(), ..truth.photos[1].clone() };
-        let error = add_photo(again).1.err().unwrap();
+        let error = add_photo(&truth, again).err().unwrap();
         assert!(error.error.to_string().contains("again: the same picture as train_01"), "{}", error.error);
     }
 }

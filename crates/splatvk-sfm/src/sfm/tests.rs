@@ -101,7 +101,7 @@ fn refusal(photos: &[Photo]) -> String {
 
 #[test]
 fn reconstruct_refuses_photos_without_geometry() {
-    let truth = testing::train(&testing::folder());
+    let truth = testing::small_train();
     let a = &truth.photos[0];
     let twice = [a.clone(), Photo { stem: "copy".into(), ..a.clone() }];
     assert!(refusal(&twice).contains("identical photos: train_00–copy"));
