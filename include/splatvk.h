@@ -449,17 +449,21 @@ enum SvkPieces
 #endif // defined(__cplusplus) || __STDC_VERSION__ >= 202311L
  {
     /*
-     Things as a whole.
+     Things and surfaces, none of them within another.
      */
     SVK_PIECES_THINGS = 0,
     /*
-     Their parts.
+     Masks of parts.
      */
     SVK_PIECES_PARTS = 1,
     /*
      Parts of parts.
      */
     SVK_PIECES_SUBPARTS = 2,
+    /*
+     Masks of wholes, which may join things with their table.
+     */
+    SVK_PIECES_WHOLES = 3,
 };
 #ifndef __cplusplus
 #if __STDC_VERSION__ >= 202311L
@@ -1365,7 +1369,7 @@ typedef struct {
      */
     const char *format;
     /*
-     SvkPieces: level of the files; objects.json lists all three.
+     SvkPieces: level of the files; objects.json lists all.
      */
     uint32_t pieces;
     /*
@@ -1413,7 +1417,7 @@ typedef struct {
      */
     uint32_t thorough;
     /*
-     Selection as of `splatvk edit`: words, ids of things ("id:l3"), ranges ("opacity<0.1",
+     Selection as of `splatvk edit`: words, ids of things ("id:o3"), ranges ("opacity<0.1",
      "size>5cm", "reliability<0.3", "seen<1"), joined with " + ", " - " or " & ". NULL with
      SVK_OPERATION_FLOATERS.
      */

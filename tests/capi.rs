@@ -431,7 +431,7 @@ fn things_are_written_with_files() {
         assert_eq!(thing["splats"], splats.len());
     }
     assert!(files.iter().all(|o| o["level"] == "o"));
-    assert!(files.iter().any(|o| o["name"] == "lemon" && o["named"] == true));
+    assert!(files.iter().any(|o| o["names"][0]["text"] == "lemon"));
     assert!(["objects.csv", "scene.glb", "scene.ply"].iter().all(|name| out.join(name).is_file()));
     unsafe {
         svk_scene_destroy(scene);

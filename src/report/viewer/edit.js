@@ -207,7 +207,7 @@ function choice(label, all, chosen, choose) {
 }
 
 function words() {
-  const input = make("input", { placeholder: "blue mug, id:l3, opacity<0.1", "aria-label": "Words, an id or a range", autocomplete: "off", maxLength: 300 });
+  const input = make("input", { placeholder: "blue mug, id:o3, opacity<0.1", "aria-label": "Words, an id or a range", autocomplete: "off", maxLength: 300 });
   return make("form", { onsubmit: (e) => { e.preventDefault(); if (input.value.trim()) add({ text: input.value.trim(), grow: 0 }); } },
     input, make("button", { type: "submit" }, "Select"));
 }

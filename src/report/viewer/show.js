@@ -11,7 +11,7 @@ import { changed } from "splatvk/stage";
 export const modes = [
   { name: "Colour", mode: "colour" },
   { name: "Depth", mode: "depth" },
-  ...levels.flatMap((l, level) => (l.colours.length ? [{ name: l.title, mode: "level", level }] : [])),
+  ...levels.flatMap((l, level) => (l.colours.length ? [{ name: l.title, mode: "level", level }] : [])).reverse(),
   ...(!manifest.presented && levels.some((l) => l.colours.length) ? [{ name: "Relevancy", mode: "relevancy" }] : []),
   ...(manifest.unseen ? [{ name: "Guessed", mode: "unseen", title: "What no photo shows, in magenta" }] : []),
 ];

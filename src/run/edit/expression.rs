@@ -22,7 +22,7 @@ pub fn terms(text: &str, scene: &Scene, grow: f32) -> Result<Vec<Term>> {
         let part = next.map_or(rest, |(at, ..)| &rest[..at]).trim();
         if part.is_empty() {
             return Err(Error::input(format!(
-                "\"{text}\": a part of the selection is empty; give words, ids (id:l3) or ranges (opacity<0.1), \
+                "\"{text}\": a part of the selection is empty; give words, ids (id:o3) or ranges (opacity<0.1), \
                  joined with \" + \", \" - \" or \" & \""
             )));
         }
