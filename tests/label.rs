@@ -77,18 +77,18 @@ fn labelled_scene_answers_and_lists_things() {
     let list: Value = serde_json::from_slice(&std::fs::read(out.join("objects.json")).unwrap()).unwrap();
     let list = list["objects"].as_array().unwrap();
     let of_level = |name: &str| list.iter().filter(|o| o["level"] == name).count();
-    assert!(of_level("l") > 0 && printed.contains(&format!("{} things", of_level("l"))), "{printed}");
+    assert!(of_level("o") > 0 && printed.contains(&format!("{} things", of_level("o"))), "{printed}");
     let rows = std::fs::read_to_string(out.join("objects.csv")).unwrap().lines().count();
     assert_eq!(rows, list.len() + 1);
 
     // Identifiers are unique, parents are of coarser levels.
-    let order = |level: &Value| ["s", "m", "l"].iter().position(|l| level == l).unwrap();
+    let order = |level: &Value| ["s", "m", "o", "l"].iter().position(|l| level == l).unwrap();
     for (k, object) in list.iter().enumerate() {
         assert!(list[..k].iter().all(|other| other["id"] != object["id"]), "{object}");
         let parent = list.iter().find(|other| other["id"] == object["parent"]);
         assert_eq!(parent.is_some(), !object["parent"].is_null());
         assert!(parent.is_none_or(|p| order(&p["level"]) > order(&object["level"])));
-        assert_eq!(object["file"].is_null(), object["level"] != "l");
+        assert_eq!(object["file"].is_null(), object["level"] != "o");
     }
     // The files have the splats of the list, and so has the column of the scene.
     let total: usize = list
@@ -103,7 +103,7 @@ fn labelled_scene_answers_and_lists_things() {
     let numbers = object_column(&out.join("scene.ply"));
     assert_eq!(numbers.iter().filter(|n| **n > 0).count(), total);
     let nodes = names(&out.join("scene.glb"));
-    let things = list.iter().filter(|o| o["level"] == "l").map(|o| o["name"].as_str().unwrap());
+    let things = list.iter().filter(|o| o["level"] == "o").map(|o| o["name"].as_str().unwrap());
     assert!(
         nodes[0] == "labelled" && things.clone().all(|name| nodes.iter().any(|n| n == name)),
         "{nodes:?}"

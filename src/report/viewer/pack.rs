@@ -373,7 +373,7 @@ mod tests {
         let mut r = Reader(&raw);
         assert_eq!(&r.take::<8>(), MAGIC);
         let head: [u32; 4] = std::array::from_fn(|_| u32::from_le_bytes(r.take()));
-        assert_eq!(head, [n as u32, 2, 2, 1]);
+        assert_eq!(head, [n as u32, 2, 4, 1]);
         let sh_scales: [f32; 3] = std::array::from_fn(|_| r.f32());
         let ranges: Vec<[f32; 10]> =
             (0..n.div_ceil(BLOCK)).map(|_| std::array::from_fn(|_| r.f32())).collect();
@@ -439,7 +439,12 @@ mod tests {
         for &s in &order {
             assert_eq!(r.u16(), [1, 2, 0][s % 3], "code + 1, or none for a feature of length 0.05");
         }
-        assert!(order.iter().all(|_| r.u16() == 0), "a level without codes");
+        assert!((0..2 * n).all(|_| r.u16() == 0), "levels without codes");
+        let things = order.iter().filter(|s| match r.u16() {
+            0 => false,
+            code => code == [1, 2, 0][*s % 3],
+        });
+        assert!(2 * things.count() > n, "most splats belong to a thing of their code");
         for &s in &order {
             assert_eq!(r.u8(), u8::from(s % 2 == 0), "even ones are in no photo");
         }

@@ -58,11 +58,8 @@ impl Places {
         }
         let most_common = |part: &Thing| {
             let mut counts: BTreeMap<usize, usize> = BTreeMap::new();
-            part.instance
-                .splats
-                .iter()
-                .filter_map(|i| codes[*i])
-                .for_each(|c| *counts.entry(c).or_default() += 1);
+            let own = part.instance.splats.iter().filter_map(|i| codes[*i]);
+            own.for_each(|code| *counts.entry(code).or_default() += 1);
             let (code, count) = counts.into_iter().max_by_key(|(code, count)| (*count, *code))?;
             (2 * count > part.instance.splats.len()).then_some(code)
         };
