@@ -205,7 +205,7 @@ impl Scene {
             },
         )
     }
-    /// (N,) int32, per splat the code of its thing, that of the thing's largest part; -1 without one.
+    /// (N,) int32, code of the largest part of the thing of each splat; -1 without one.
     #[getter]
     fn things<'py>(this: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         Self::kept(

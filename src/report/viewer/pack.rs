@@ -15,7 +15,8 @@
 //! | red, green, blue | u8 × N each | 0.5 + SH₀ · DC in the block's range |
 //! | SH rest | i8 × N, 3 R times | coefficient by coefficient, RGB; 127 = the scale of its degree |
 //! | codes | u16 × N, L times | code + 1 per level, in the order of [`LEVELS`]; 0 = none |
-//! | kinds | u8 × N | sum of 1: no photo shows it, 2: of a [hole](Layers::holes), 4: of the backdrop, 8: of a surface that carries things |
+//! | kinds | u8 × N | sum of 1: no photo shows it, 2: of a [hole](Layers::holes), 4: of the
+//! backdrop, 8: of a surface |
 //!
 //! Planes of one quantity deflate better than records. A position is exact to 1/65535 of a block,
 //! which is a few neighbouring splats wide.

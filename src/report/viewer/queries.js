@@ -52,7 +52,7 @@ export function setQuery(answer) {
     find(".v-ask input").value = answer.text;
     const of = (k) => answer.relevancy[answer.level][k];
     const best = answer.codes.reduce((a, b) => (of(b) > of(a) ? b : a), answer.codes[0]);
-    const as = answer.found ? `, as a ${levels[answer.level].one.toLowerCase()}` : "; the heat shows what is nearest";
+    const as = answer.found ? `, among the ${levels[answer.level].title.toLowerCase()}` : "; the heat shows what is nearest";
     const found = answer.verdict[0].toUpperCase() + answer.verdict.slice(1) + as;
     const notes = (answer.notes ?? []).map((note) => `; ${note}`).join("");
     const time = answer.milliseconds === undefined ? "" : `, ${answer.milliseconds.toFixed(0)} ms`;

@@ -253,7 +253,7 @@ impl Editor {
 
 /// Of `things`, which share no splat, the one with the splat of `splats` that is nearest to a place.
 /// Specks of its codes that are no thing of their own go with it, as with a word.
-fn nearest(
+pub(super) fn nearest(
     places: &Places,
     things: &[Vec<usize>],
     splats: &[usize],

@@ -1,6 +1,6 @@
 use super::complete::completed;
 use super::floaters;
-use super::select::{grown, is_inside};
+use super::select::{grown, is_inside, nearest};
 use crate::format::scene_dir::Scene;
 use crate::query::instances::Places;
 use crate::scene::{Camera, Codebook, Image, LanguageField, LevelField, Pose, SH_C0, Splats};
@@ -16,6 +16,20 @@ fn splats(places: &[[f32; 3]], greys: &[f32]) -> Splats {
         sh: greys.iter().flat_map(|grey| [(grey - 0.5) / SH_C0; 3]).collect(),
         ..Splats::default()
     }
+}
+
+/// Places of splats with features of one level, whose two codes are (1, 0) and (0, 1).
+fn places_of(splats: &Splats, features: Vec<f32>) -> Places {
+    let rows = vec![1.0, 0.0, 0.0, 1.0];
+    let codebook = Codebook {
+        embedding_dim: 2,
+        code_dim: 2,
+        embeddings: rows.clone(),
+        codes: rows,
+        ..Codebook::default()
+    };
+    let level = LevelField { codebook, features, ..LevelField::default() };
+    Places::of(splats, &LanguageField { levels: vec![level], space: String::new() })
 }
 
 #[test]
@@ -52,21 +66,25 @@ fn hidden_splats_join_the_thing_of_their_place_and_colour() {
         40..120 => [0.0, 1.0],
         _ => [0.0, 0.0],
     });
-    let rows = vec![1.0, 0.0, 0.0, 1.0];
-    let codebook = Codebook {
-        embedding_dim: 2,
-        code_dim: 2,
-        embeddings: rows.clone(),
-        codes: rows,
-        ..Codebook::default()
-    };
-    let level = LevelField { codebook, features: features.collect(), ..LevelField::default() };
-    let places = Places::of(&splats, &LanguageField { levels: vec![level], space: String::new() });
+    let places = places_of(&splats, features.collect());
     let all = completed((0..40).collect(), &splats, &places.lists()[0]);
     // The bright splat at the floor stays with the floor, and so does the dark one on it.
     let hidden: Vec<usize> = all.iter().copied().filter(|i| *i >= 40).collect();
     assert_eq!(hidden, [120], "{hidden:?}");
     assert!(all.is_sorted() && all.len() == 41);
+}
+
+/// A thing of the codes 0 and 1, a speck of code 1 of no thing, and another thing of code 1.
+#[test]
+fn click_on_a_part_selects_its_thing_with_specks() {
+    let splats = splats(
+        &[[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.2, 0.0, 1.0], [9.0, 0.0, 1.0], [5.0, 0.0, 1.0]],
+        &[0.5; 5],
+    );
+    let places = places_of(&splats, vec![1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0]);
+    let things = [vec![0, 1, 2], vec![4]];
+    let at = |x: f64| nearest(&places, &things, &[2, 3, 4], glam::DVec3::new(x, 0.0, 1.0), 0);
+    assert_eq!((at(0.3), at(4.0)), (vec![0, 1, 2, 3], vec![3, 4]));
 }
 
 #[test]

@@ -69,9 +69,10 @@ impl Places {
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::level_of;
+    use super::super::things::OBJECTS;
     use super::*;
-    use crate::query::things::OBJECTS;
-    use crate::scene::{Codebook, LanguageField, LevelField, Splats};
+    use crate::scene::{LanguageField, LevelField, Splats};
 
     /// Splats of cubes: centre, half of the side, and the codes of part and whole.
     fn places(cubes: &[([f32; 3], f32, usize, usize)]) -> Places {
@@ -84,21 +85,7 @@ mod tests {
             }
         }
         let count = means.len();
-        let unit = |k: usize| (0..4).map(move |c| f32::from(u8::from(c == k)));
-        let level = |at: usize| {
-            let rows: Vec<f32> = (0..4).flat_map(unit).collect();
-            LevelField {
-                codebook: Codebook {
-                    embedding_dim: 4,
-                    code_dim: 4,
-                    embeddings: rows.clone(),
-                    codes: rows,
-                    ..Codebook::default()
-                },
-                features: codes.iter().flat_map(|own| unit(own[at])).collect(),
-                ..LevelField::default()
-            }
-        };
+        let level = |at: usize| level_of(codes.iter().map(|own| own[at]), 4);
         let splats = Splats {
             means,
             log_scales: vec![[0.2f32.ln(); 3]; count],

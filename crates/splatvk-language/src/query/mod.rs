@@ -18,6 +18,8 @@ mod result;
 mod score;
 pub mod select;
 mod surfaces;
+#[cfg(test)]
+mod testing;
 pub mod things;
 pub mod window;
 

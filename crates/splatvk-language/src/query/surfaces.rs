@@ -96,9 +96,10 @@ impl Places {
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::level_of;
     use super::super::things::OBJECTS;
     use super::*;
-    use crate::scene::{Codebook, LanguageField, LevelField, Splats};
+    use crate::scene::{LanguageField, LevelField, Splats};
 
     /// A table of two patches, a wall, and a cube on the table; a code each.
     #[test]
@@ -119,20 +120,7 @@ mod tests {
         }
         means.iter_mut().skip(5400).for_each(|mean| mean[2] -= 1.95);
         let count = means.len();
-        let unit = |k: usize| (0..4).map(move |c| f32::from(u8::from(c == k)));
-        let rows: Vec<f32> = (0..4).flat_map(unit).collect();
-        let codebook = Codebook {
-            embedding_dim: 4,
-            code_dim: 4,
-            embeddings: rows.clone(),
-            codes: rows,
-            ..Codebook::default()
-        };
-        let level = LevelField {
-            codebook,
-            features: codes.into_iter().flat_map(unit).collect(),
-            ..LevelField::default()
-        };
+        let level = level_of(codes, 4);
         let splats = Splats {
             means,
             log_scales: vec![[0.06f32.ln(); 3]; count],

@@ -171,8 +171,9 @@ pub fn numbers<'a>(things: impl Iterator<Item = &'a Thing>, level: usize, splats
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::level_of;
     use super::*;
-    use crate::scene::{Codebook, LanguageField, LevelField, Splats};
+    use crate::scene::{LanguageField, LevelField, Splats};
 
     /// 20 splats of a cup at x = 0 and 20 of a second one at x = 5, on a table of 60 at y = 1, and a
     /// speck of two far away.
@@ -191,20 +192,7 @@ mod tests {
             opacity_logits: vec![2.0; count],
             ..Splats::default()
         };
-        let codes = vec![1.0, 0.0, 0.0, 1.0];
-        let level = |code_of: fn(usize) -> usize| LevelField {
-            codebook: Codebook {
-                embedding_dim: 2,
-                code_dim: 2,
-                embeddings: codes.clone(),
-                codes: codes.clone(),
-                ..Codebook::default()
-            },
-            features: (0..count)
-                .flat_map(|i| if code_of(i) == 0 { [1.0, 0.0] } else { [0.0, 1.0] })
-                .collect(),
-            ..LevelField::default()
-        };
+        let level = |code_of: fn(usize) -> usize| level_of((0..count).map(code_of), 2);
         // Whole: cups are code 0, the table and the speck code 1. Part: halves of the first cup.
         let (whole, part) = (level(|i| usize::from(i >= 40)), level(|i| usize::from(i >= 10)));
         (splats, LanguageField { levels: vec![LevelField::default(), part, whole], space: String::new() })
@@ -217,7 +205,7 @@ mod tests {
         let listed: Vec<_> =
             things.iter().map(|t| (t.level, t.number(), t.instance.splats.len(), t.parent)).collect();
         // Of the part level, code 1 is the rest: the second half of the first cup is too small
-        // beside the table, of which it is no part. All lie on one plane, so that they are one object.
+        // beside the table, of which it is no part. All lie on one plane: they are one object.
         assert_eq!(
             listed,
             [
