@@ -345,6 +345,21 @@ mod tests {
     use super::*;
     use crate::scene::{Scale, Seen, Splats, seeded};
 
+    /// The worker that sorts imports nothing: it has a copy of the bits of marks, and would draw hidden
+    /// splats with another one.
+    #[test]
+    fn worker_has_the_marks_of_the_page() {
+        let number = |text: &str, name: &str| {
+            let (_, rest) = text.split_once(name).unwrap();
+            rest.chars().take_while(char::is_ascii_digit).collect::<String>().parse::<u8>().unwrap()
+        };
+        let (page, worker) = (include_str!("splats.js"), include_str!("sort.js"));
+        for name in ["hole", "backdrop", "hidden"] {
+            let own = number(worker, &format!("{} = ", name.to_uppercase()));
+            assert_eq!(own, number(page, &format!("{name}: ")), "{name}");
+        }
+    }
+
     /// The page stays small enough to be sent: code, style and markup, compressed.
     #[test]
     fn page_without_data_is_small() {

@@ -207,9 +207,8 @@ impl Editor {
         let at = pixel_of(camera, pixel)?;
         let maps = self.words()?.codes(camera)?;
         let codes: Vec<Option<usize>> = maps.iter().map(|map| usize::try_from(map.data[at]).ok()).collect();
-        let code_of = |level: usize| Some((level, (*codes.get(self.places().code_level(level))?)?));
-        let levels = level.map_or(vec![OBJECTS, 2, 1, 0], |level| vec![level]);
-        let (level, code) = levels.into_iter().find_map(code_of).ok_or_else(|| {
+        let found = clicked(level, &codes, self.places().code_level(OBJECTS));
+        let (level, code) = found.ok_or_else(|| {
             let [x, y] = pixel;
             Error::input(format!("{}: there is no thing at pixel {x:.0}, {y:.0}", camera.name))
         })?;
@@ -249,6 +248,21 @@ impl Editor {
         };
         Ok(shown.into_par_iter().filter(inside).collect())
     }
+}
+
+/// Level and code that a click selects on a pixel with these codes, by level; things have those of
+/// level `of_things`.
+pub(super) fn clicked(
+    level: Option<usize>,
+    codes: &[Option<usize>],
+    of_things: usize,
+) -> Option<(usize, usize)> {
+    let code_of = |level: usize| {
+        let code = *codes.get(if level == OBJECTS { of_things } else { level })?;
+        Some((level, code?))
+    };
+    let levels = level.map_or(vec![OBJECTS, 2, 1, 0], |level| vec![level]);
+    levels.into_iter().find_map(code_of)
 }
 
 /// Of `things`, which share no splat, the one with the splat of `splats` that is nearest to a place.

@@ -1,8 +1,9 @@
 use super::complete::completed;
 use super::floaters;
-use super::select::{grown, is_inside, nearest};
+use super::select::{clicked, grown, is_inside, nearest};
 use crate::format::scene_dir::Scene;
 use crate::query::instances::Places;
+use crate::query::things::OBJECTS;
 use crate::scene::{Camera, Codebook, Image, LanguageField, LevelField, Pose, SH_C0, Splats};
 use glam::DVec2;
 
@@ -72,6 +73,15 @@ fn hidden_splats_join_the_thing_of_their_place_and_colour() {
     let hidden: Vec<usize> = all.iter().copied().filter(|i| *i >= 40).collect();
     assert_eq!(hidden, [120], "{hidden:?}");
     assert!(all.is_sorted() && all.len() == 41);
+}
+
+#[test]
+fn click_selects_a_thing_before_the_coarsest_mask() {
+    let all = [Some(5), Some(6), Some(7)];
+    assert_eq!((clicked(None, &all, 1), clicked(Some(2), &all, 1)), (Some((OBJECTS, 6)), Some((2, 7))));
+    let no_part = [Some(5), None, Some(7)];
+    assert_eq!((clicked(None, &no_part, 1), clicked(Some(1), &no_part, 1)), (Some((2, 7)), None));
+    assert_eq!(clicked(None, &[None; 3], 1), None);
 }
 
 /// A thing of the codes 0 and 1, a speck of code 1 of no thing, and another thing of code 1.
