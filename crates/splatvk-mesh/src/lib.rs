@@ -9,6 +9,7 @@ mod collider;
 mod distance;
 mod extract;
 mod frame;
+mod labels;
 mod surface;
 #[cfg(test)]
 mod tests;

@@ -171,6 +171,9 @@ pub struct ObjectAccuracyArgs {
     /// Folder with ground_truth.json and masks, one per scene
     #[arg(long, value_name = "DIR", required = true)]
     pub ground_truth: Vec<PathBuf>,
+    /// Also compare the sizes of things in the mesh with those that the depth of the photos states
+    #[arg(long)]
+    pub sizes: bool,
     /// Device and models
     #[command(flatten)]
     pub device: DeviceArgs,
