@@ -1,5 +1,6 @@
 //! Sizes of things against those of true objects, as photos show them.
 use glam::{DVec2, DVec3};
+use serde_json::{Value, json};
 use splatvk::scene::{Camera, Image};
 use std::collections::BTreeMap;
 
@@ -28,9 +29,14 @@ pub struct Size {
 }
 
 impl Size {
-    /// Largest relative error of the three.
-    pub fn error(&self) -> f64 {
-        (self.found / self.known - 1.0).abs().max_element()
+    /// Relative errors of the three.
+    pub fn errors(&self) -> DVec3 {
+        self.found / self.known - 1.0
+    }
+
+    /// The size for programs.
+    pub fn json(&self) -> Value {
+        json!({ "name": self.name, "found": self.found.to_array(), "truth": self.known.to_array() })
     }
 }
 
@@ -78,14 +84,14 @@ mod tests {
     #[test]
     fn size_is_that_of_the_shown_surface() {
         let camera = Camera {
+            name: String::new(),
+            width: 4,
+            height: 2,
             fx: 2.0,
             fy: 2.0,
             cx: 2.0,
             cy: 1.0,
-            width: 4,
-            height: 2,
-            pose: Pose::default(),
-            ..Camera::default()
+            pose: Pose::IDENTITY,
         };
         // Pixels are half a unit apart at depth 1 and a unit at depth 2.
         let photo = TruePhoto {
@@ -97,7 +103,7 @@ mod tests {
         assert_eq!(sizes.len(), 1);
         assert!((sizes[&1] - DVec3::new(1.0, 0.75, 1.0)).length() < 1e-9, "{sizes:?}");
         let size = Size { name: "cup".into(), found: DVec3::new(1.1, 0.6, 1.0), known: sizes[&1] };
-        assert!((size.error() - 0.2).abs() < 1e-9);
+        assert!((size.errors() - DVec3::new(0.1, -0.2, 0.0)).length() < 1e-9);
     }
 
     #[test]

@@ -171,7 +171,7 @@ pub struct ObjectAccuracyArgs {
     /// Folder with ground_truth.json and masks, one per scene
     #[arg(long, value_name = "DIR", required = true)]
     pub ground_truth: Vec<PathBuf>,
-    /// Also compare the sizes of things in the mesh with those that the depth of the photos states
+    /// Compare the sizes of things in the mesh with those of the truth that the photos show instead
     #[arg(long)]
     pub sizes: bool,
     /// Device and models

@@ -42,32 +42,28 @@ pub fn object_accuracy(args: &ObjectAccuracyArgs) -> Result<()> {
         let truth = GroundTruth::read(truth)?;
         let scene = scene::load(scene, EditUse::default())?;
         let things = things(&scene)?;
-        add(&scene, &things, &truth, &device, &mut scores)?;
-        if args.sizes {
-            sizes.extend(measured(&scene, &things, &truth, &device)?);
+        match args.sizes {
+            true => sizes.extend(measured(&scene, &things, &truth, &device)?),
+            false => add(&scene, &things, &truth, &device, &mut scores)?,
         }
     }
-    match args.device.json {
-        true => print_json(&figures(&scores, args.sizes.then_some(&sizes))),
-        false => print(&(text(&scores) + &if args.sizes { table(&sizes) } else { String::new() })),
+    match (args.device.json, args.sizes) {
+        (true, true) => print_json(&sizes.iter().map(Size::json).collect()),
+        (true, false) => print_json(&figures(&scores)),
+        (false, true) => print(&table(&sizes)),
+        (false, false) => print(&text(&scores)),
     }
 }
 
-fn figures(scores: &[[Panoptic; 2]], sizes: Option<&Vec<Size>>) -> Value {
-    let score = |score: &Panoptic| {
+fn figures(scores: &[[Panoptic; 2]]) -> Value {
+    let figures = |score: &Panoptic| {
         json!({
             "pq": score.quality(), "sq": score.segmentation(), "rq": score.recognition(),
             "matched": score.matched, "extra": score.extra, "missed": score.missed,
         })
     };
-    let level = |(name, [all, small]): (&&str, &[Panoptic; 2])| json!({ "level": name, "all": score(all), "small": score(small) });
-    let mut out = json!({ "levels": LEVELS.iter().zip(scores).map(level).collect::<Vec<_>>() });
-    if let Some(sizes) = sizes {
-        let size =
-            |s: &Size| json!({ "name": s.name, "found": s.found.to_array(), "truth": s.known.to_array() });
-        out["sizes"] = sizes.iter().map(size).collect();
-    }
-    out
+    let level = |(name, [all, small]): (&&str, &[Panoptic; 2])| json!({ "level": name, "all": figures(all), "small": figures(small) });
+    LEVELS.iter().zip(scores).map(level).collect()
 }
 
 fn text(scores: &[[Panoptic; 2]]) -> String {
@@ -93,7 +89,7 @@ fn table(sizes: &[Size]) -> String {
         "object                    size (x y z)           truth                  error (x y z)\n".to_owned();
     for size in sizes {
         let row = |v: DVec3| v.to_array().map(|v| format!("{v:.3}")).join(" ");
-        let errors = (size.found / size.known - 1.0).to_array().map(|e| format!("{:+.1}", 100.0 * e));
+        let errors = size.errors().to_array().map(|e| format!("{:+.1}", 100.0 * e));
         text += &format!(
             "{:<25} {:<22} {:<22} {} %\n",
             size.name,
@@ -102,8 +98,7 @@ fn table(sizes: &[Size]) -> String {
             errors.join(" ")
         );
     }
-    let mut errors: Vec<f64> =
-        sizes.iter().flat_map(|s| (s.found / s.known - 1.0).abs().to_array()).collect();
+    let mut errors: Vec<f64> = sizes.iter().flat_map(|s| s.errors().abs().to_array()).collect();
     errors.sort_by(f64::total_cmp);
     let Some(median) = errors.get(errors.len() / 2) else {
         return text + "no thing is an object of the truth\n";
