@@ -98,7 +98,7 @@ fn word_thing_and_click_delete_the_same() {
     assert_eq!((word.count, &word.rows), (splats_of(MUG), &click.rows));
     assert!(word.doubts.len() == 1 && click.doubts.is_empty());
     let [x, y] = pixel;
-    let told = runs(&mut edit(&path, &["--delete", &format!("at:{x},{y}@train_00"), "--dry-run"]));
+    let told = runs(&mut edit(&path, &["--delete", &format!("at:train_00:{x},{y}"), "--dry-run"]));
     assert!(told.contains(&format!("{} splats", splats_of(MUG))), "{told}");
 
     // An outline around the mug, cut down to the answer, is the visible part of it.

@@ -237,8 +237,8 @@ pub struct SvkEdit {
     /// through.
     pub thorough: u32,
     /// Selection as of `splatvk edit`: words, ids of things ("id:o3"), ranges ("opacity<0.1",
-    /// "size>5cm", "reliability<0.3", "seen<1"), the thing at a pixel of a photo ("at:X,Y@PHOTO"),
-    /// an outline there ("in:X,Y X,Y X,Y@PHOTO"), joined with " + ", " - " or " & ". NULL with
+    /// "size>5cm", "reliability<0.3", "seen<1"), the thing at a pixel of a photo ("at:PHOTO:X,Y"),
+    /// an outline there ("in:PHOTO:X,Y X,Y X,Y"), joined with " + ", " - " or " & ". NULL with
     /// SVK_OPERATION_FLOATERS.
     pub selection: *const c_char,
     /// Words select more (above 0) or less (below 0), -1 to 1.

@@ -27,8 +27,8 @@ pub struct EditArgs {
     /// Scene directory
     pub scene: PathBuf,
     /// Remove what is selected: words, ids of `splatvk objects` (id:o3), ranges (opacity<0.1,
-    /// size>5cm, reliability<0.3, seen<1), the thing at a pixel of a photo (at:320,240@a.jpg), an
-    /// outline there (in:0,0 9,0 9,9@a.jpg), joined with " + ", " - " or " & "
+    /// size>5cm, reliability<0.3, seen<1), the thing at a pixel of a photo (at:a.jpg:320,240), an
+    /// outline there (in:a.jpg:0,0 9,0 9,9), joined with " + ", " - " or " & "
     #[arg(long, value_name = "SELECTION")]
     pub delete: Vec<String>,
     /// Keep only what is selected

@@ -214,7 +214,7 @@ impl<'a> Run<'a> {
         let scale = SceneScale::measure(cameras, &splats.means);
         let model = Model::new(device, splats, channels)?;
         let (capacity, near) = (splats.len(), scale.near());
-        let views = Views::new(device, &[(photos, &options.losses)], 0.0, capacity, channels, near)?;
+        let views = Views::new(device, &[(photos, &options.losses)], capacity, channels, near)?;
         let targets = CodeTargets::new(device, &fields, images, &views, 1.0 - options.image_weight)?;
         let raster = RasterOptions {
             sh_degree: splats.sh_degree,

@@ -202,7 +202,7 @@ impl RgbOptions {
                 sh_rest: 2.5e-3 / 20.0 * speed,
             },
             colour_pixels: 0.1,
-            losses: Losses { depth: Some(0.02), needles: Some(1e-3), opacity: OPACITY, ..Losses::PHOTOS },
+            losses: Losses { depth: Some(0.3), needles: Some(1e-3), opacity: OPACITY, ..Losses::PHOTOS },
             min_confidence: 0.5,
             virtual_views: 12,
             bounded: true,

@@ -68,7 +68,7 @@ impl Trained {
     }
 }
 
-/// Fits splats to photos. `depths`, if given, regularises where a view's depth is confident.
+/// Fits splats to photos. `depths`, if given, regularises where a view's depth is known.
 /// Deterministic for a seed up to the order of float atomics on the device.
 pub fn train_rgb(
     device: &Device,
@@ -235,7 +235,7 @@ impl<'a> Run<'a> {
             groups.push((virtual_views.photos(), &Losses::VIRTUAL));
         }
         let growth = options.densify.map_or(1, |densify| densify.growth);
-        let views = Views::new(device, &groups, confidence, growth * start.len(), 0, scale.near())?;
+        let views = Views::new(device, &groups, growth * start.len(), 0, scale.near())?;
         let density =
             options.densify.map(|densify| Density::new(device, densify, start.len())).transpose()?;
         let model = Model::new(device, start, 0)?;

@@ -51,11 +51,10 @@ pub(super) fn slot(band: &Band) -> u32 {
 
 impl Views {
     /// Uploads photos with the inputs of their losses, and allocates for `capacity` splats with
-    /// `feature_dim` features. Depth is used from `min_confidence` on.
+    /// `feature_dim` features.
     pub(super) fn new(
         device: &Device,
         groups: &[(Photos, &Losses)],
-        min_confidence: f32,
         capacity: usize,
         feature_dim: usize,
         near: f64,
@@ -70,7 +69,7 @@ impl Views {
                 let size = sizes[list.len()];
                 raster.set_size(size)?;
                 let bands = raster.frame().bands.clone();
-                list.push(upload(device, photos, photo, (losses, min_confidence), size, bands)?);
+                list.push(upload(device, photos, photo, losses, size, bands)?);
             }
         }
         let bands: Vec<Bands> = list.iter().map(|view| view.bands.clone()).collect();
@@ -137,13 +136,13 @@ fn upload(
     device: &Device,
     Photos { images, depths, coverage, .. }: &Photos,
     photo: usize,
-    (losses, min_confidence): (&Losses, f32),
+    losses: &Losses,
     size: [u32; 2],
     bands: Bands,
 ) -> Result<TrainView> {
     let image = &images[photo];
     let depth = depths.filter(|_| losses.depth.is_some()).and_then(|maps| maps.get(photo));
-    let depth = depth.map(|m| confident_depth(m, min_confidence, image)).transpose()?.flatten();
+    let depth = depth.map(|m| known_depth(m, image)).transpose()?.flatten();
     let inner = |name, plane: &[f32], void: f32| -> Result<Vec<Buffer<f32>>> {
         let band = |b| device.buffer_from(name, &bands.cut_inner(&b, plane, void));
         Ok(bands.iter().map(band).collect::<gpu::Result<_>>()?)
@@ -179,9 +178,9 @@ fn colours(frame: &FrameBuffers, band: &Band) -> Result<Vec<[f32; 3]>> {
     Ok(rows.map(|i| [0, 1, 2].map(|c| planes[c * stride + i].clamp(0.0, 1.0))).collect())
 }
 
-/// Depth where its confidence is at least `least`, and the number of such pixels; `None` without
-/// any.
-fn confident_depth(map: &DepthMap, least: f32, image: &RgbImage) -> Result<Option<(Vec<f32>, usize)>> {
+/// Depth where it has a confidence, and the number of such pixels; `None` without any. Depth that
+/// stereo only filled counts, too: without texture nothing else holds the splats on the surface.
+fn known_depth(map: &DepthMap, image: &RgbImage) -> Result<Option<(Vec<f32>, usize)>> {
     if map.depth.data.len() != image.data.len() || map.confidence.data.len() != image.data.len() {
         return Err(Error::work("a depth map does not have the size of its photo"));
     }
@@ -190,7 +189,7 @@ fn confident_depth(map: &DepthMap, least: f32, image: &RgbImage) -> Result<Optio
         .data
         .iter()
         .zip(&map.confidence.data)
-        .map(|(&z, &c)| if c >= least && z > 0.0 && z.is_finite() { z } else { 0.0 })
+        .map(|(&z, &c)| if c > 0.0 && z > 0.0 && z.is_finite() { z } else { 0.0 })
         .collect();
     let count = depth.iter().filter(|z| **z > 0.0).count();
     Ok((count > 0).then_some((depth, count)))

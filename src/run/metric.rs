@@ -33,7 +33,7 @@ impl Place {
 }
 
 /// Parses numbers between commas; `None` unless all are finite.
-fn finite_numbers(text: &str) -> Option<Vec<f64>> {
+pub(super) fn finite_numbers(text: &str) -> Option<Vec<f64>> {
     text.split(',').map(|n| n.trim().parse().ok().filter(|v: &f64| v.is_finite())).collect()
 }
 
@@ -191,7 +191,8 @@ fn position(scene: &Scene, depths: &[(&str, Image<f32>)], place: &Place) -> Resu
     }
 }
 
-fn camera<'a>(scene: &'a Scene, view: &str) -> Result<&'a Camera> {
+/// Camera of a view by its name without ending.
+pub(super) fn camera<'a>(scene: &'a Scene, view: &str) -> Result<&'a Camera> {
     scene.cameras.iter().find(|c| stem(&c.name) == view).ok_or_else(|| {
         let names: Vec<&str> = scene.cameras.iter().map(|c| stem(&c.name)).collect();
         Error::input(format!("{view}: no view of the scene; it has {}", names.join(", ")))

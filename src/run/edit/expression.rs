@@ -1,9 +1,9 @@
-//! Selections as text: words, ids, ranges, places and outlines in photos, joined with ` + `, ` - `
+//! Selections as text: words, ids, ranges, pixels and outlines in photos, joined with ` + `, ` - `
 //! and ` & `.
 use crate::format::edits::{Combine, Pick, Property, Term};
 use crate::format::scene_dir::Scene;
 use crate::photo::stem;
-use crate::run::metric::Distance;
+use crate::run::metric::{Distance, camera, finite_numbers};
 use crate::scene::Camera;
 use crate::{Error, Result};
 
@@ -13,9 +13,6 @@ const SIGNS: [(&str, Combine); 3] =
 
 /// Name of the camera of the page, which is no photo.
 const VIEW: &str = "view";
-/// Most photos that a message names.
-const SHOWN: usize = 8;
-
 /// Parses a selection. `grow` is that of its words ([`Pick::Word`]). A size with m, cm or mm needs
 /// the scale of the scene.
 ///
@@ -31,7 +28,7 @@ pub fn terms(text: &str, scene: &Scene, grow: f32) -> Result<Vec<Term>> {
         if part.is_empty() {
             return Err(Error::input(format!(
                 "\"{text}\": a part of the selection is empty; give words, ids (id:o3), ranges (opacity<0.1) or \
-                 places (at:X,Y@PHOTO), joined with \" + \", \" - \" or \" & \""
+                 pixels (at:PHOTO:X,Y), joined with \" + \", \" - \" or \" & \""
             )));
         }
         terms.push(Term { combine, pick: pick(part, scene, grow)? });
@@ -45,14 +42,14 @@ fn pick(part: &str, scene: &Scene, grow: f32) -> Result<Pick> {
         return Ok(Pick::Thing { id: id.trim().to_owned() });
     }
     if let Some(place) = part.strip_prefix("at:") {
-        let (corners, camera) = in_photo(part, place, scene)?;
-        let [pixel] = corners[..] else {
-            return Err(Error::input(format!("\"{part}\": give one pixel, X,Y; in: takes an outline")));
+        let (pixels, camera) = in_view(part, place, scene)?;
+        let [pixel] = pixels[..] else {
+            return Err(Error::input(format!("\"{part}\": at: takes one pixel; in: takes an outline")));
         };
         return Ok(Pick::Click { camera, pixel, level: None });
     }
     if let Some(outline) = part.strip_prefix("in:") {
-        let (polygon, camera) = in_photo(part, outline, scene)?;
+        let (polygon, camera) = in_view(part, outline, scene)?;
         return Ok(Pick::Outline { camera, polygon, through: false });
     }
     match part.find(['<', '>']) {
@@ -61,39 +58,16 @@ fn pick(part: &str, scene: &Scene, grow: f32) -> Result<Pick> {
     }
 }
 
-/// `X,Y X,Y …@PHOTO`: pixels, and the camera of the photo.
-fn in_photo(part: &str, text: &str, scene: &Scene) -> Result<(Vec<[f64; 2]>, Camera)> {
-    let invalid = |reason: String| Error::input(format!("\"{part}\": {reason}"));
-    let (pixels, name) = text
-        .rsplit_once('@')
-        .ok_or_else(|| invalid("name the photo, as in at:320,240@IMG_0012.jpg".into()))?;
-    let name = name.trim();
-    let named = |camera: &&Camera| camera.name == name || stem(&camera.name) == name;
-    let camera = match scene.cameras.iter().filter(named).collect::<Vec<_>>()[..] {
-        [camera] => camera.clone(),
-        [] => {
-            let names: Vec<&str> = scene.cameras.iter().map(|camera| camera.name.as_str()).collect();
-            return Err(invalid(format!("the scene has no photo \"{name}\"; it has {}", shortened(&names))));
-        }
-        [..] => return Err(invalid(format!("\"{name}\" is more than one photo; add the ending"))),
+/// `VIEW:x,y x,y …`: pixels, and the camera of the view.
+fn in_view(part: &str, text: &str, scene: &Scene) -> Result<(Vec<[f64; 2]>, Camera)> {
+    let pixels = |text: &str| -> Option<Vec<[f64; 2]>> {
+        text.split_whitespace().map(|pixel| finite_numbers(pixel)?.try_into().ok()).collect()
     };
-    let corner = |corner: &str| {
-        let (x, y) = corner.split_once(',')?;
-        let number = |v: &str| v.parse::<f64>().ok().filter(|v| v.is_finite());
-        Some([number(x)?, number(y)?])
-    };
-    let corners: Option<Vec<[f64; 2]>> = pixels.split_whitespace().map(corner).collect();
-    let corners = corners.ok_or_else(|| invalid("pixels are X,Y, with spaces between them".into()))?;
-    Ok((corners, camera))
-}
-
-/// The first names of a list.
-fn shortened(names: &[&str]) -> String {
-    match names {
-        [] => "none".to_owned(),
-        [first @ .., _] if first.len() >= SHOWN => format!("{}, …", names[..SHOWN].join(", ")),
-        _ => names.join(", "),
-    }
+    let parsed = text.rsplit_once(':').and_then(|(view, text)| Some((view, pixels(text)?)));
+    let (view, pixels) = parsed.ok_or_else(|| {
+        Error::input(format!("\"{part}\": give a photo and pixels, as in at:IMG_1.jpg:112,140"))
+    })?;
+    Ok((pixels, camera(scene, stem(view.trim()))?.clone()))
 }
 
 /// `PROPERTY<VALUE` or `PROPERTY>VALUE`, with the sign at a position.
@@ -132,7 +106,7 @@ pub fn text(term: &Term) -> String {
         Pick::Click { camera, pixel: [x, y], .. } if camera.name == VIEW => {
             format!("click at {x:.0}, {y:.0}")
         }
-        Pick::Click { camera, pixel: [x, y], .. } => format!("at:{x},{y}@{}", camera.name),
+        Pick::Click { camera, pixel: [x, y], .. } => format!("at:{}:{x},{y}", camera.name),
         Pick::Outline { polygon, .. } => format!("outline of {} corners", polygon.len()),
         Pick::Floaters { thorough } => if *thorough { "thorough floaters" } else { "floaters" }.to_owned(),
     };
@@ -209,24 +183,20 @@ mod tests {
             cy: 4.5,
             pose: Pose::IDENTITY,
         };
-        scene.cameras = ["a.jpg", "b.jpg", "b.png"].iter().map(camera).collect();
+        scene.cameras = ["a.jpg", "b.jpg"].iter().map(camera).collect();
         scene
     }
 
     #[test]
     fn places_and_outlines_are_in_photos() {
-        let found = terms("at:3.5,4@a - in:0,0 9,0 9,9@b.png", &scene(), 0.0).unwrap();
-        let [a, .., b] = &scene().cameras[..] else { unreachable!() };
+        let found = terms("at:a:3.5,4 - in:b.jpg:0,0 9,0 9,9", &scene(), 0.0).unwrap();
+        let [a, b] = &scene().cameras[..] else { unreachable!() };
         let click = Pick::Click { camera: a.clone(), pixel: [3.5, 4.0], level: None };
         let polygon = vec![[0.0, 0.0], [9.0, 0.0], [9.0, 9.0]];
         let outline = Pick::Outline { camera: b.clone(), polygon, through: false };
         let expected = [(Combine::Add, click), (Combine::Remove, outline)];
         assert_eq!(found, expected.map(|(combine, pick)| Term { combine, pick }));
-        assert_eq!(texts(&found), "at:3.5,4@a.jpg - outline of 3 corners");
-        let names: Vec<String> = (0..20).map(|k| format!("{k}.jpg")).collect();
-        let names: Vec<&str> = names.iter().map(String::as_str).collect();
-        assert_eq!(shortened(&names), "0.jpg, 1.jpg, 2.jpg, 3.jpg, 4.jpg, 5.jpg, 6.jpg, 7.jpg, …");
-        assert_eq!([shortened(&names[..8]), shortened(&[])], [names[..8].join(", "), "none".to_owned()]);
+        assert_eq!(texts(&found), "at:a.jpg:3.5,4 - outline of 3 corners");
     }
 
     #[test]
@@ -248,11 +218,10 @@ mod tests {
             ("age<3", "no property is called \"age\""),
             ("opacity<3cm", "has no unit"),
             ("seen<x", "give a distance"),
-            ("at:3,4", "name the photo"),
-            ("at:3,4@c", "it has a.jpg, b.jpg, b.png"),
-            ("at:3,4@b", "more than one photo"),
-            ("at:3 4@a", "pixels are X,Y"),
-            ("at:3,4 5,6@a", "give one pixel"),
+            ("at:3,4", "give a photo and pixels"),
+            ("at:c:3,4", "it has a, b"),
+            ("at:a:3,4,5", "give a photo and pixels"),
+            ("at:a:3,4 5,6", "at: takes one pixel"),
         ] {
             let error = terms(text, &scene(), 0.0).unwrap_err();
             assert!(error.exit_code() == 2 && error.to_string().contains(words), "{error}");
