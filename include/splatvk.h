@@ -1418,7 +1418,8 @@ typedef struct {
     uint32_t thorough;
     /*
      Selection as of `splatvk edit`: words, ids of things ("id:o3"), ranges ("opacity<0.1",
-     "size>5cm", "reliability<0.3", "seen<1"), joined with " + ", " - " or " & ". NULL with
+     "size>5cm", "reliability<0.3", "seen<1"), the thing at a pixel of a photo ("at:PHOTO:X,Y"),
+     an outline there ("in:PHOTO:X,Y X,Y X,Y"), joined with " + ", " - " or " & ". NULL with
      SVK_OPERATION_FLOATERS.
      */
     const char *selection;
