@@ -213,3 +213,20 @@ fn check_inputs(Photos { images, cameras, .. }: &Photos) -> Result<()> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Image;
+
+    #[test]
+    fn filled_depth_is_known_too() {
+        let row = |data: [f32; 4]| Image { width: 4, height: 1, data: data.to_vec() };
+        let map = DepthMap { depth: row([2.0, 3.0, f32::NAN, 4.0]), confidence: row([0.1, 0.9, 0.9, 0.0]) };
+        let image = RgbImage { width: 4, height: 1, data: vec![[0.0; 3]; 4] };
+        assert_eq!(known_depth(&map, &image).unwrap(), Some((vec![2.0, 3.0, 0.0, 0.0], 2)));
+        let unknown = DepthMap { confidence: row([0.0; 4]), ..map.clone() };
+        assert_eq!(known_depth(&unknown, &image).unwrap(), None);
+        assert!(known_depth(&map, &RgbImage { width: 1, height: 1, data: vec![[0.0; 3]] }).is_err());
+    }
+}
