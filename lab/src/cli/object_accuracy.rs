@@ -169,20 +169,22 @@ fn measured(scene: &Scene, things: &[Thing], truth: &GroundTruth, device: &Devic
     let found = shown(scene, &owners, &cameras.iter().collect::<Vec<_>>(), device)?;
     let matched = matches(found.iter().zip(photos.iter().map(|photo| &photo.objects)));
     let number = |owner: &u32| matched.keys().position(|thing| thing == owner).map_or(0, |k| k as u32 + 1);
-    let names = matched.values().map(|object| truth.labels.get(object).cloned().unwrap_or_default());
-    let parts = Things { object: owners.iter().map(number).collect(), names: names.collect() };
+    // Names of objects may be the same, their numbers are not.
+    let names = matched.values().map(u32::to_string).collect();
+    let parts = Things { object: owners.iter().map(number).collect(), names };
     let options = MeshOptions { voxel: None, simplify: Simplify::Triangles(TRIANGLES), fill_guessed: false };
     let progress = progress::reporter();
     let made = mesh::on_device(device, scene, &scene.cameras, Some(&parts), "", options, progress.as_ref())?;
     let placed = mesh::placed(&made.mesh, &to_truth);
     let known = extents(&photos);
-    let size = |(name, object): (&String, &u32)| {
-        let part = placed.parts.iter().find(|part| part.name == *name)?;
+    let size = |object: &u32| {
+        let part = placed.parts.iter().find(|part| part.name == object.to_string())?;
         let (low, high) = placed.part(part).extent()?;
         let found = DVec3::from_array([0, 1, 2].map(|k| f64::from(high[k] - low[k])));
-        Some(Size { name: name.clone(), found, known: *known.get(object)? })
+        let name = truth.labels.get(object).cloned().unwrap_or_default();
+        Some(Size { name, found, known: *known.get(object)? })
     };
-    Ok(parts.names.iter().zip(matched.values()).filter_map(size).collect())
+    Ok(matched.values().filter_map(size).collect())
 }
 
 /// Per view the owner of most of every pixel, 0 = none.
