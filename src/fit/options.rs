@@ -84,7 +84,8 @@ pub struct RgbOptions {
     pub losses: Losses,
     /// Number of virtual views, photos warped by their depth at half their resolution.
     pub virtual_views: usize,
-    /// Least confidence of stereo depth that is used.
+    /// Least confidence of stereo depth that warps photos and continues surfaces; the depth loss
+    /// takes all depth.
     pub min_confidence: f32,
     /// Whether splats are clamped: in every photo behind the least depth of that photo, and no
     /// larger than a share of their distance to the nearest camera. Applied at the start, when
