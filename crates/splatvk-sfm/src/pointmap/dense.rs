@@ -16,6 +16,10 @@ const SAME_DEPTH: f64 = 0.01;
 /// Share of least confident pixels that give no points, at any scale of the confidence.
 const UNUSED_SHARE: f64 = 0.2;
 
+/// Confidence below which a pixel has no depth; that of the least confident point is 1. The sky has
+/// any depth.
+const LEAST_DEPTH: f64 = 0.5;
+
 /// Depth and confidence of one view at model resolution.
 struct Layer {
     camera: Camera,
@@ -171,7 +175,7 @@ fn to_working_size(view: &ModelView, l: &Layer) -> DepthMap {
                     z = k.iter().zip(wt).map(|(&k, w)| w * l.depth[k]).sum();
                 }
             }
-            if l.confidence[nearest] > 0.0 && z > 0.0 {
+            if l.confidence[nearest] >= LEAST_DEPTH && z > 0.0 {
                 out.depth.data[y * w + x] = z as f32;
                 out.confidence.data[y * w + x] = l.confidence[nearest] as f32;
             }
