@@ -5,12 +5,11 @@ use std::collections::{HashMap, VecDeque};
 /// Area of an island from which it belongs to its label, relative to the largest island of the
 /// label: behind the silhouette of a thing, a few triangles in the air have its label.
 const CRUMB: f64 = 0.02;
-/// Steps from triangle to triangle, about two per voxel, between the border of a label and the
-/// middle of a strip from which the strip belongs to the label: depth is that of neither thing in a
-/// strip of this width at the silhouette of one before another.
+/// Half the width of the widest strip of a label that joins the label beside it, in triangles, about
+/// two per voxel. At the silhouette of a thing, the depth in such a strip is that of no thing.
 const SHRED: u32 = 6;
-/// Least share of the area of a label that must remain without strips; a label with less is thin
-/// everywhere, as a spoon is, and keeps them.
+/// Share of the area of a label that its strips must leave; a label with less is thin everywhere, as
+/// a spoon is, and keeps them.
 const SOLID: f64 = 0.5;
 
 impl Surface {
@@ -62,8 +61,8 @@ impl Adjacent {
         }
     }
 
-    /// Morphological opening: the triangles of a label that no part of it reaches that is wider than
-    /// twice [`SHRED`].
+    /// Whether a triangle is in a strip of its label: a morphological opening by [`SHRED`] steps
+    /// removes it.
     fn shreds(&self, labels: &[u32]) -> Vec<bool> {
         let mut same = vec![Vec::new(); labels.len()];
         let mut edge = self.at_border.clone();
@@ -91,8 +90,8 @@ impl Adjacent {
         (0..labels.len()).map(|t| is_shred(t) && is_solid(labels[t])).collect()
     }
 
-    /// Gives the label that most of their border touches to `loose` triangles, to islands of less than
-    /// `least` square units and to crumbs.
+    /// `loose` triangles, islands of less than `least` square units, and crumbs get the label that
+    /// most of their border touches.
     fn join(&self, labels: &mut [u32], loose: &[bool], least: f64) {
         let mut sets = Sets::new(labels.len());
         for [a, b] in &self.pairs {
@@ -140,8 +139,7 @@ impl Adjacent {
     }
 }
 
-/// Least number of steps between neighbours from any of `first` to each, `u32::MAX` where none leads
-/// there.
+/// Number of steps between neighbours from the nearest of `first`; `u32::MAX` where none leads.
 fn steps(neighbours: &[Vec<u32>], first: impl Iterator<Item = u32>) -> Vec<u32> {
     let mut steps = vec![u32::MAX; neighbours.len()];
     let mut next: VecDeque<u32> = first.collect();
