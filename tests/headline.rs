@@ -71,7 +71,8 @@ fn small_run_reaches_headline_figures() {
         lemon("train"),
         lemon("test"),
     );
-    // Measured: 0.061 degrees, 0.054 %, 0.08 %, 0.968; depth 0.48 % and 0.47 %; 30.3 and 28.3 dB;
+    // Measured: 0.061 degrees, 0.054 %, 0.08 %, 0.968; depth 0.49 % and 0.46 %, with the
+    // weight of the stereo depth at 0.02 0.76 % and 0.74 %; 32.4 and 31.0 dB;
     // localised 0.97, mIoU 0.63. Float atomics, drivers and seeds change these by a few percent,
     // mIoU from 0.62 to 0.77 (seeds 0 to 2), and may cost one answer; a broken stage costs far
     // more.
@@ -79,8 +80,8 @@ fn small_run_reaches_headline_figures() {
     assert!(worst("centre_fraction") < 0.0015, "centre");
     assert!(worst("focal_relative") < 0.004, "focal");
     assert!(figure(&report["relative_poses"], "auc_3") > 0.93, "auc");
-    assert!(figure(train, "depth_median_relative") < 0.008, "train depth");
-    assert!(figure(test, "depth_median_relative") < 0.008, "held-out depth");
+    assert!(figure(train, "depth_median_relative") < 0.006, "train depth");
+    assert!(figure(test, "depth_median_relative") < 0.006, "held-out depth");
     assert!(figure(train, "psnr") > 28.5, "train PSNR");
     assert!(figure(test, "psnr") > 26.0, "held-out PSNR");
     assert!(lemon("train").iter().chain(&lemon("test")).filter(|l| !**l).count() <= 1, "lemon");

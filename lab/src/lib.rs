@@ -1,8 +1,8 @@
 //! The laboratory of splatvk: the tables of the paper's experiments ([`ablate`]), its pictures
 //! ([`figures`]), data with ground truth ([`generate`]), the alignment alone ([`alignment`]),
-//! quality against seconds of training ([`curve`]), panoptic quality ([`panoptic`]), sizes of things
-//! ([`sizes`]), evaluation protocols ([`protocol`]), and their commands ([`cli`], program `splatlab`).
-//! It is not part of the installed program.
+//! quality against seconds of training ([`curve`]), panoptic quality ([`panoptic`]), sizes of
+//! things ([`sizes`]), evaluation protocols ([`protocol`]), and their commands ([`cli`], program
+//! `splatlab`). It is not part of the installed program.
 #![warn(missing_docs)]
 // [N, 3] in the docs states a shape; rustdoc takes it for a link.
 #![allow(rustdoc::broken_intra_doc_links)]

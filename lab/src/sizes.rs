@@ -7,7 +7,8 @@ use std::collections::BTreeMap;
 /// IoU over all photos from which a thing is an object.
 const MATCH: f64 = 0.5;
 
-/// A photo with its true camera, object of every pixel (0 = none) and depth (camera z, 0 = unknown).
+/// A photo with its true camera, object (0 = none) and depth (camera z, 0 = unknown) of every
+/// pixel.
 pub struct TruePhoto {
     /// Camera in the true world.
     pub camera: Camera,

@@ -5,11 +5,11 @@ use std::collections::{HashMap, VecDeque};
 /// Area of an island from which it belongs to its label, relative to the largest island of the
 /// label: behind the silhouette of a thing, a few triangles in the air have its label.
 const CRUMB: f64 = 0.02;
-/// Half the width of the widest strip of a label that joins the label beside it, in triangles, about
-/// two per voxel. At the silhouette of a thing, the depth in such a strip is that of no thing.
+/// Half the width of the widest strip of a label that joins the label beside it, in triangles,
+/// about two per voxel. At the silhouette of a thing, the depth in such a strip is that of no thing.
 const SHRED: u32 = 6;
-/// Share of the area of a label that its strips must leave; a label with less is thin everywhere, as
-/// a spoon is, and keeps them.
+/// Share of the area of a label that its strips must leave; a label with less is thin everywhere,
+/// as a spoon is, and keeps them.
 const SOLID: f64 = 0.5;
 
 impl Surface {

@@ -345,8 +345,8 @@ mod tests {
     use super::*;
     use crate::scene::{Scale, Seen, Splats, seeded};
 
-    /// The worker that sorts imports nothing: it has a copy of the bits of marks, and would draw hidden
-    /// splats with another one.
+    /// The worker that sorts imports nothing: it has a copy of the bits of marks, and would draw
+    /// hidden splats with another one.
     #[test]
     fn worker_has_the_marks_of_the_page() {
         let number = |text: &str, name: &str| {

@@ -106,8 +106,13 @@ pub fn text(term: &Term) -> String {
         Pick::Click { camera, pixel: [x, y], .. } if camera.name == VIEW => {
             format!("click at {x:.0}, {y:.0}")
         }
-        Pick::Click { camera, pixel: [x, y], .. } => format!("at:{}:{x},{y}", camera.name),
-        Pick::Outline { polygon, .. } => format!("outline of {} corners", polygon.len()),
+        Pick::Click { camera, pixel: [x, y], .. } => format!("at:{}:{x},{y}", stem(&camera.name)),
+        Pick::Outline { camera, polygon, .. } if camera.name == VIEW => {
+            format!("outline of {} corners", polygon.len())
+        }
+        Pick::Outline { camera, polygon, .. } => {
+            format!("outline of {} corners in {}", polygon.len(), stem(&camera.name))
+        }
         Pick::Floaters { thorough } => if *thorough { "thorough floaters" } else { "floaters" }.to_owned(),
     };
     sign.to_owned() + &pick
@@ -196,7 +201,7 @@ mod tests {
         let outline = Pick::Outline { camera: b.clone(), polygon, through: false };
         let expected = [(Combine::Add, click), (Combine::Remove, outline)];
         assert_eq!(found, expected.map(|(combine, pick)| Term { combine, pick }));
-        assert_eq!(texts(&found), "at:a.jpg:3.5,4 - outline of 3 corners");
+        assert_eq!(texts(&found), "at:a:3.5,4 - outline of 3 corners in b");
     }
 
     #[test]

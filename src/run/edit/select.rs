@@ -306,7 +306,10 @@ fn pixel_of(camera: &Camera, [x, y]: [f64; 2]) -> Result<usize> {
     let inside = |v: f64, size: u32| (0.0..f64::from(size)).contains(&v);
     match inside(x, camera.width) && inside(y, camera.height) {
         true => Ok(y as usize * camera.width as usize + x as usize),
-        false => Err(Error::input(format!("{}: pixel {x}, {y} is outside of the view", camera.name))),
+        false => Err(Error::input(format!(
+            "{}: pixel {x}, {y} is outside of the view, which has {} × {}",
+            camera.name, camera.width, camera.height
+        ))),
     }
 }
 
