@@ -8,6 +8,7 @@ pub mod cameras;
 pub mod compare;
 mod growth;
 mod latency;
+mod least;
 pub mod masks;
 pub mod measure;
 mod model;
@@ -17,6 +18,7 @@ mod sorting;
 mod training;
 pub mod workload;
 
+pub use least::{Least, Limits};
 pub use measure::{Budget, Quartiles};
 pub use model::Roofline;
 pub use report::{BenchReport, PassRow, Section};

@@ -1,10 +1,11 @@
-//! Least work of each pass: bytes that must move at least once, and arithmetic on blended pairs.
-//! The roofline shows the overhead of an implementation, such as pairs evaluated without effect or
-//! lists read twice.
+//! Least work of each pass, first version (`floor v1`): bytes that must move at least once, and
+//! arithmetic on blended pairs. [`super::least`] replaces it; it stays for one release, so that
+//! ratios can be compared.
 //!
 //! Floats per splat: 11 of geometry and opacity, 3 per SH coefficient, d features; of a projected
 //! splat PROJECTED_FLOATS. Operations are counted from the formulas of the passes, a fused
 //! multiply-add as two, an exponential as one.
+use super::least::Limits;
 use crate::gpu::shaders;
 use crate::pass::fused_update;
 
@@ -13,8 +14,10 @@ use crate::pass::fused_update;
 pub struct Roofline {
     /// Bytes read plus bytes written by a copy, per second.
     pub bytes_per_second: f64,
-    /// Floating-point operations, two per fused multiply-add, per second.
+    /// Floating-point operations of shaders, two per fused multiply-add, per second.
     pub flops_per_second: f64,
+    /// Limits of the second floor, where the passes run: in shaders or in native code.
+    pub limits: Limits,
 }
 
 impl Roofline {
@@ -39,6 +42,8 @@ pub struct PassWork {
     pub intersections: f64,
     /// Pixel–splat pairs that change a pixel.
     pub blended: f64,
+    /// Pixel–splat pairs in rows of a tile in which the splat changes a pixel.
+    pub in_rows: f64,
     /// Whether projection backward, the penalty on needles and Adam are one pass.
     pub fused: bool,
 }
@@ -59,7 +64,7 @@ const WEIGH_BACK: f64 = 30.0;
 impl PassWork {
     /// (bytes, operations) of a pass by its name in a recording; `None` for passes without a model.
     pub fn of(&self, pass: &str) -> Option<(f64, f64)> {
-        let PassWork { splats: n, sh, features: d, pixels, intersections, blended, fused } = *self;
+        let PassWork { splats: n, sh, features: d, pixels, intersections, blended, fused, .. } = *self;
         let (colour, channels) = (12.0 * sh, 4.0 + d);
         let listed = intersections * (4.0 + PROJECTED + 4.0 * d);
         Some(match pass {

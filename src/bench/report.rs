@@ -1,4 +1,5 @@
 //! Benchmark report, as a table and as JSON.
+use super::least::Least;
 use super::measure::{Budget, Quartiles, cores, processor_ms};
 use super::model::{PassWork, Roofline};
 use crate::gpu::{Device, Program, Recorder};
@@ -96,9 +97,15 @@ pub struct PassRow {
     /// Least floating-point operations, estimated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub flops: Option<f64>,
-    /// Least milliseconds by the measured roofline.
+    /// Least milliseconds by the first model (floor v1), until the next release.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub floor_ms: Option<f64>,
+    /// Least work by the second model.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub least: Option<Least>,
+    /// Least milliseconds by the second model (floor v2).
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub floor_v2_ms: Option<f64>,
 }
 
 /// Clock of a time.
@@ -114,9 +121,38 @@ pub enum Clock {
 }
 
 impl PassRow {
-    /// Sets bytes, operations and the least milliseconds for them.
-    fn set_floor(&mut self, [bytes, flops, ms]: [f64; 3]) {
-        (self.bytes, self.flops, self.floor_ms) = (Some(bytes), Some(flops), Some(ms));
+    /// Sets the least work and milliseconds of both models.
+    fn set_floor(&mut self, floor: &Floor) {
+        (self.bytes, self.flops) = (Some(floor.bytes), Some(floor.flops));
+        (self.floor_ms, self.least) = (Some(floor.v1_ms), Some(floor.least));
+        self.floor_v2_ms = Some(floor.v2_ms);
+    }
+}
+
+/// Least work and milliseconds of a pass by both models, or sums of them.
+#[derive(Clone, Copy, Default)]
+struct Floor {
+    bytes: f64,
+    flops: f64,
+    v1_ms: f64,
+    least: Least,
+    v2_ms: f64,
+}
+
+impl Floor {
+    /// `None` for passes without a model.
+    fn of(pass: &str, work: &PassWork, roofline: &Roofline) -> Option<Floor> {
+        let ((bytes, flops), least) = (work.of(pass)?, work.least(pass)?);
+        let (v1_ms, v2_ms) = (roofline.floor_ms(bytes, flops), roofline.limits.ms(&least));
+        Some(Floor { bytes, flops, v1_ms, least, v2_ms })
+    }
+
+    fn add(&mut self, other: &Floor) {
+        self.bytes += other.bytes;
+        self.flops += other.flops;
+        self.v1_ms += other.v1_ms;
+        self.least = self.least + other.least;
+        self.v2_ms += other.v2_ms;
     }
 }
 
@@ -281,32 +317,31 @@ impl Section {
         Ok((0..timed.len()).map(|run| sums.iter().map(|(_, times)| times[run]).sum()).collect())
     }
 
-    /// Sets bytes, operations and floors of the passes, and of the rows that consist of passes.
+    /// Sets the floors of the passes, and of the rows that consist of passes.
     pub(super) fn bound(&mut self, work: &PassWork, roofline: &Roofline) {
-        let mut sums = [[0.0; 3]; 3];
+        let mut sums = [Floor::default(); 3];
         let fused = self.row(fused_update::PASS).is_some();
         let work = PassWork { fused, ..*work };
-        if let (true, Some((bytes, flops))) = (fused, work.of("projection backward")) {
+        if let (true, Some(floor)) = (fused, Floor::of("projection backward", &work, roofline)) {
             // The row "forward + backward" is measured without Adam.
-            sums[1] = [bytes, flops, roofline.floor_ms(bytes, flops)];
+            sums[1] = floor;
         }
         for row in self.rows.iter_mut().filter(|r| r.clock == Clock::Device) {
-            let Some((bytes, flops)) = work.of(&row.name) else { continue };
-            let floor = roofline.floor_ms(bytes, flops);
-            row.set_floor([bytes, flops, floor]);
+            let Some(floor) = Floor::of(&row.name, &work, roofline) else { continue };
+            row.set_floor(&floor);
             let backward = row.name.ends_with("backward");
             let forward = FORWARD.contains(&row.name.as_str());
             for (sum, counts) in sums.iter_mut().zip([forward, forward || backward, true]) {
                 if counts {
-                    sum.iter_mut().zip([bytes, flops, floor]).for_each(|(s, v)| *s += v);
+                    sum.add(&floor);
                 }
             }
         }
         let composed = ["forward", "forward + backward", STEP];
         for row in &mut self.rows {
             match composed.iter().position(|c| *c == row.name) {
-                Some(at) => row.set_floor(sums[at]),
-                None if row.name == SUM => row.set_floor(sums[2]),
+                Some(at) => row.set_floor(&sums[at]),
+                None if row.name == SUM => row.set_floor(&sums[2]),
                 None => {}
             }
         }
@@ -318,8 +353,18 @@ impl Section {
         if !self.rows.is_empty() {
             let _ = writeln!(
                 text,
-                "  {:<28} {:>10} {:>19} {:>9} {:>5}  {:<6} {:>9} {:>9} {:>8} {:>8}",
-                "", "median ms", "quartiles", "best", "runs", "clock", "cpu ms", "floor ms", "MB", "MFLOP"
+                "  {:<28} {:>9} {:>19} {:>9}  {:<6} {:>7} {:>8} {:>8} {:>5} {:>7} {:>8}",
+                "",
+                "median ms",
+                "quartiles",
+                "best",
+                "clock",
+                "cpu ms",
+                "floor v1",
+                "floor v2",
+                "×",
+                "MB",
+                "Mslots"
             );
         }
         for row in &self.rows {
@@ -327,16 +372,19 @@ impl Section {
             let clock = if row.clock == Clock::Device { "device" } else { "wall" };
             let quartiles = format!("{:.3}–{:.3}", ms.lower_quartile, ms.upper_quartile);
             let cpu = if ms.processor > 0.0 { format!("{:.1}", ms.processor) } else { String::new() };
-            let floor = row.floor_ms.map_or(String::new(), |f| format!("{f:.3}"));
-            let mega = |v: Option<f64>| v.map_or(String::new(), |v| format!("{:.1}", v / 1e6));
+            let number =
+                |value: Option<f64>, digits: usize| value.map_or(String::new(), |v| format!("{v:.digits$}"));
+            let mega = |of: fn(&Least) -> f64| number(row.least.map(|least| of(&least) / 1e6), 1);
             let line = format!(
-                "  {:<28} {:>10.3} {quartiles:>19} {:>9.3} {:>5}  {clock:<6} {cpu:>9} {floor:>9} {:>8} {:>8}",
+                "  {:<28} {:>9.3} {quartiles:>19} {:>9.3}  {clock:<6} {cpu:>7} {:>8} {:>8} {:>5} {:>7} {:>8}",
                 row.name,
                 ms.median,
                 ms.best,
-                ms.runs,
-                mega(row.bytes),
-                mega(row.flops)
+                number(row.floor_ms, 3),
+                number(row.floor_v2_ms, 3),
+                number(row.floor_v2_ms.map(|floor| ms.median / floor), 1),
+                mega(|least| least.bytes),
+                mega(|least| least.slots),
             );
             let _ = writeln!(text, "{}", line.trim_end());
         }

@@ -159,7 +159,7 @@ fn add_figures(
     let p = run.trainer().step_resources();
     let frame = p.raster.frame();
     let intersections = f64::from(frame.status.read()?[0]);
-    let [evaluated, blended] = pairs::count(device, p.raster)?;
+    let pairs = pairs::count(device, p.raster)?;
     let seconds = section.row(STEP).map_or(f64::NAN, |r| r.ms.median / 1e3);
     let pixels = f64::from(frame.width) * f64::from(frame.height);
     let work = PassWork {
@@ -168,15 +168,17 @@ fn add_figures(
         features: p.params.feature_dim as f64,
         pixels,
         intersections,
-        blended,
+        blended: pairs.blended,
+        in_rows: pairs.in_rows,
         ..PassWork::default()
     };
     section.bound(&work, roofline);
     section.figure("intersections", intersections, "tile–splat pairs");
-    section.figure("pairs evaluated", evaluated, "pixel–splat pairs");
-    section.figure("pairs blended", blended, "pixel–splat pairs");
-    section.figure("evaluated / blended", evaluated / blended, "");
-    section.figure("blended per pixel", blended / pixels, "");
+    section.figure("pairs evaluated", pairs.evaluated, "pixel–splat pairs");
+    section.figure("pairs blended", pairs.blended, "pixel–splat pairs");
+    section.figure("evaluated / blended", pairs.evaluated / pairs.blended, "");
+    section.figure("pairs in rows with a blended one", pairs.in_rows, "pixel–splat pairs");
+    section.figure("blended per pixel", pairs.blended / pixels, "");
     section.figure("splats per second", work.splats / seconds / 1e6, "M/s");
     section.figure("intersections per second", intersections / seconds / 1e6, "M/s");
     Ok(())

@@ -1,14 +1,26 @@
-//! Counts of pixel–splat pairs: evaluated by the raster kernels, and blended into a pixel.
+//! Counts of pixel–splat pairs: evaluated by the raster shaders, blended into a pixel, and in rows of
+//! a tile with any blended pair.
 use super::rasterizer::Rasterizer;
 use super::tile_lists::TILE;
 use crate::Result;
 use crate::gpu::{Device, Recorder, shaders};
 
-/// Counts the [evaluated, blended] pairs of the last forward pass.
-pub fn count(device: &Device, raster: &Rasterizer) -> Result<[f64; 2]> {
+/// Pixel–splat pairs of a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pairs {
+    /// Evaluated by the raster shaders.
+    pub evaluated: f64,
+    /// Blended into a pixel.
+    pub blended: f64,
+    /// Pairs in rows of a tile (8 × 1 pixels) in which the splat is blended into a pixel.
+    pub in_rows: f64,
+}
+
+/// Counts the pairs of the last forward pass.
+pub fn count(device: &Device, raster: &Rasterizer) -> Result<Pairs> {
     let frame = raster.frame();
     let tiles = frame.tiles();
-    let counts = device.buffer::<u32>("pair counts", 2 * (TILE * TILE * tiles[0] * tiles[1]) as usize)?;
+    let counts = device.buffer::<u32>("pair counts", 4 * (TILE * TILE * tiles[0] * tiles[1]) as usize)?;
     let call = shaders::count_pairs::call(
         &shaders::count_pairs::Bindings {
             projected: &frame.projected,
@@ -22,7 +34,8 @@ pub fn count(device: &Device, raster: &Rasterizer) -> Result<[f64; 2]> {
     rec.dispatch(call, [tiles[0], tiles[1], 1]);
     rec.run()?;
     let counts = counts.read()?;
-    Ok([0, 1].map(|k| counts.iter().skip(k).step_by(2).map(|&c| f64::from(c)).sum()))
+    let sum = |k: usize| counts.iter().skip(k).step_by(4).map(|&c| f64::from(c)).sum();
+    Ok(Pairs { evaluated: sum(0), blended: sum(1), in_rows: sum(2) })
 }
 
 #[cfg(test)]
@@ -34,6 +47,7 @@ mod tests {
     use crate::pass::reference;
     use crate::pass::{FeatureMode, RasterOptions, SplatBuffers};
     use crate::scene::seeded;
+    use std::collections::BTreeSet;
 
     #[test]
     fn pair_counts_match_reference() {
@@ -44,7 +58,7 @@ mod tests {
         let mut raster = Rasterizer::new(&device, 600, 0, 75, 53).unwrap();
         raster.set_view(&view).unwrap();
         raster.forward(&params, &RasterOptions::default()).unwrap();
-        let [evaluated, blended] = count(&device, &raster).unwrap();
+        let Pairs { evaluated, blended, in_rows } = count(&device, &raster).unwrap();
 
         let forward =
             reference::forward(&Params::new(&splats, &[], 0), &view, FeatureMode::Linear, &Cutoffs::STANDARD);
@@ -55,10 +69,16 @@ mod tests {
             order: &forward.order,
             view: &view,
         };
-        let pixels = (0..53).flat_map(|y| (0..75).map(move |x| (x, y)));
-        let expected: usize = pixels.map(|(x, y)| walk(&scene, &Cutoffs::STANDARD, x, y).0.len()).sum();
+        let (mut pairs, mut rows) = (0, BTreeSet::new());
+        for (x, y) in (0..53).flat_map(|y| (0..75).map(move |x| (x, y))) {
+            let (list, _) = walk(&scene, &Cutoffs::STANDARD, x, y);
+            pairs += list.len();
+            rows.extend(list.iter().map(|pair| (pair.splat, x / TILE, y)));
+        }
         // f32 and f64 may disagree at the two thresholds for a pair in ten thousand.
-        assert!((blended - expected as f64).abs() <= 1e-3 * expected as f64, "{blended} of {expected}");
+        let is_near = |a: f64, b: usize| (a - b as f64).abs() <= 1e-3 * b as f64;
+        assert!(is_near(blended, pairs), "{blended} of {pairs}");
+        assert!(is_near(in_rows, TILE as usize * rows.len()), "{in_rows} in {} rows", rows.len());
         let listed: usize = raster.tile_lists().unwrap().iter().map(Vec::len).sum();
         assert!(evaluated >= blended && evaluated <= 64.0 * listed as f64, "{evaluated} {listed}");
     }

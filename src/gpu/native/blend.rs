@@ -55,7 +55,7 @@ fn rows<S: Simd, const C: usize>(simd: S, s: &Splat<C>, y: f32) -> (Row, u32) {
 
 /// 2 to the power of numbers between −126 and 126, to two units of the last place.
 #[inline(always)]
-fn exp2<S: Simd>(x: f32x8<S>) -> f32x8<S> {
+pub(super) fn exp2<S: Simd>(x: f32x8<S>) -> f32x8<S> {
     let simd = x.token();
     let number = |value: f32| f32x8::simd_from(simd, value);
     // Adding 1.5 · 2²³ rounds to a whole number, which the low bits of the sum hold.
@@ -170,6 +170,25 @@ pub(super) fn blend<S: Simd, const C: usize>(simd: S, s: &Splat<C>, [x, y]: [f32
             let sum = cover.weight.mul_add(f32x8::simd_from(simd, value), f32x8::simd_from(simd, *channel));
             sum.store_array(channel);
         }
+    });
+}
+
+/// Adds the pairs of a splat with the pixels of the tile at (`x`, `y`): evaluated, blended, and in
+/// rows with a blended one.
+#[inline(always)]
+pub(super) fn count<S: Simd>(
+    simd: S,
+    s: &Splat<0>,
+    [x, y]: [f32; 2],
+    pixels: &mut Pixels,
+    counts: &mut [u32; 3],
+) {
+    let (_, reached) = rows(simd, s, y);
+    counts[0] += EDGE as u32 * (reached & pixels.open).count_ones();
+    pixels.cover(&Columns::of(simd, s, x), s, y, |_, _, cover| {
+        let blended = cover.weight.simd_gt(0.0).to_bitmask().count_ones();
+        counts[1] += blended;
+        counts[2] += EDGE as u32 * blended.min(1);
     });
 }
 

@@ -5,6 +5,7 @@
 //! reference of a pass, and tests run on them; each native pass is compared with its
 //! shader.
 mod adam;
+mod arithmetic;
 mod bin;
 mod blend;
 mod decode;
@@ -27,6 +28,7 @@ use crate::gpu::Native;
 pub static ALL: &[Native] = &[
     Native { family: "adam", run: adam::run },
     Native { family: "alpha_l1", run: small::alpha_l1 },
+    Native { family: "bench_arithmetic", run: arithmetic::run },
     Native { family: "bin_base", run: bin::base },
     Native { family: "bin_count", run: bin::count },
     Native { family: "bin_emit", run: bin::emit },
@@ -35,6 +37,7 @@ pub static ALL: &[Native] = &[
     Native { family: "bin_sum", run: bin::sum },
     Native { family: "camera_sum", run: small::camera_sum },
     Native { family: "clear_depth_gradient", run: small::clear_depth_gradient },
+    Native { family: "count_pairs", run: raster::count_pairs },
     Native { family: "decode", run: decode::run },
     Native { family: "depth_l1", run: small::depth_l1 },
     Native { family: "features_forward", run: small::features_forward },

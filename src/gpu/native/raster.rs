@@ -1,5 +1,5 @@
-//! `raster_forward.comp` and `raster_backward.comp`.
-use super::blend::{BASE, Blended, COLOUR, FLOATS, Splat, Sums, Upstream, blend, gradients};
+//! `raster_forward.comp`, `raster_backward.comp` and `count_pairs.comp`.
+use super::blend::{BASE, Blended, COLOUR, FLOATS, Splat, Sums, Upstream, blend, count, gradients};
 use super::scatter::Scattered;
 use super::tile::{EDGE, Row, Tile, TileRows};
 use crate::gpu::NativeCall;
@@ -242,4 +242,30 @@ fn differentiate<S: Simd, const C: usize>(
             break;
         }
     }
+}
+
+/// Pairs of each tile, (evaluated, blended, in rows, 0) for its first pixel.
+pub(super) fn count_pairs(call: &mut NativeCall) -> Result<(), String> {
+    let ([width, height, tiles_x], groups, level) = (call.words()?, call.groups(), Level::new());
+    let rows = TileRows::of_image(width as usize, height as usize, tiles_x as usize);
+    let [projected, ranges, splats, counts] = call.memory([0, 1, 2, 3])?;
+    let (projected, ranges): (&[[f32; FLOATS]], &[u32]) = (projected.of(), ranges.of());
+    let splats: &[[u32; 2]] = splats.of();
+    let counts = counts.of::<[u32; 4]>().par_chunks_exact_mut(EDGE * EDGE * groups[0] as usize);
+    counts.take(groups[1] as usize).enumerate().for_each(|(row, counts)| {
+        counts.fill([0; 4]);
+        for (tile, counts) in rows.tiles(groups, row).zip(counts.chunks_exact_mut(EDGE * EDGE)) {
+            let (mut pixels, mut sums) = (tile.pixels(), [0; 3]);
+            let at = [tile.x as f32, tile.y as f32];
+            for [splat, _] in &splats[ranges[tile.list] as usize..ranges[tile.list + 1] as usize] {
+                let splat = Splat::of(&projected[*splat as usize], &[], false);
+                dispatch!(level, simd => count(simd, &splat, at, &mut pixels, &mut sums));
+                if pixels.open == 0 {
+                    break;
+                }
+            }
+            counts[0][..3].copy_from_slice(&sums);
+        }
+    });
+    Ok(())
 }

@@ -9,7 +9,7 @@ use crate::pass::adam::{Class, Moments, Schedule};
 use crate::pass::bands::{Band, Bands};
 use crate::pass::ssim_l1::{SsimL1, SsimRowKernel};
 use crate::pass::view::View;
-use crate::pass::{RasterOptions, Rasterizer, SplatBuffers};
+use crate::pass::{RasterOptions, Rasterizer, SplatBuffers, pairs};
 use crate::scene::{DepthMap, Image, RgbImage, Splats, seeded};
 
 /// The device without native passes, and with them.
@@ -152,6 +152,22 @@ fn rasterisation_matches_shaders() {
             );
         }
     }
+}
+
+#[test]
+fn pair_counts_match_shader() {
+    let [shader, native] = devices().map(|device| {
+        let (splats, camera) = seeded::benchmark(900, 75, 53, 0, 5);
+        let params = SplatBuffers::upload(&device, &splats, &[], 0).unwrap();
+        let mut raster = Rasterizer::new(&device, 900, 0, 75, 53).unwrap();
+        raster.set_view(&View::new(&camera, 0.05)).unwrap();
+        raster.forward(&params, &RasterOptions::default()).unwrap();
+        pairs::count(&device, &raster).unwrap()
+    });
+    // Rounding may move single pairs over a threshold.
+    assert!((shader.blended - native.blended).abs() <= 1e-3 * shader.blended, "{shader:?} {native:?}");
+    assert!((shader.in_rows - native.in_rows).abs() <= 1e-3 * shader.in_rows, "{shader:?} {native:?}");
+    assert!(native.in_rows <= native.evaluated && native.evaluated < shader.evaluated, "{native:?}");
 }
 
 /// Splats after some steps with every loss.

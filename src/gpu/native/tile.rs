@@ -27,6 +27,11 @@ impl TileRows {
         Ok(TileRows { width, top, rows, first_row, list_row, tiles_x })
     }
 
+    /// All rows of an image.
+    pub fn of_image(width: usize, rows: usize, tiles_x: usize) -> TileRows {
+        TileRows { width, top: 0, rows, first_row: 0, list_row: 0, tiles_x }
+    }
+
     /// Pixels of the planes.
     pub fn pixels(&self) -> usize {
         self.width * self.rows

@@ -17,4 +17,15 @@ pub fn bench(device: &Device) {
     assert!(target.read().unwrap() == data);
     // x / 2 + 1 / 4 tends to 1 / 2, in each of 16 chains.
     assert!(values.read().unwrap().iter().all(|v| (v - 8.0).abs() < 1e-4));
+    for (exponentials, fixed) in [(0, 0.5), (1, 0.641_186)] {
+        let mut rec = Recorder::new(device, "arithmetic");
+        let call = shaders::bench_arithmetic::call(
+            shaders::bench_arithmetic::Variant { exponentials },
+            &shaders::bench_arithmetic::Bindings { values: &values },
+            &shaders::bench_arithmetic::Push { rounds: 8 },
+        );
+        rec.dispatch(call, [2, 1, 1]);
+        rec.run().unwrap();
+        assert!(values.read().unwrap().iter().all(|v| (v / 16.0 - fixed).abs() < 1e-4));
+    }
 }

@@ -9,6 +9,7 @@ use splatvk::pass::raster_forward::{Cutoffs, ReferenceScene, walk};
 use splatvk::pass::{DeviceChoices, FeatureMode, GradientReduction, ShGradientKernel, TileBinning, TileSums};
 use splatvk::pass::{bin, pairs as counting};
 use splatvk::scene::seeded;
+use std::collections::BTreeSet;
 
 /// Splats over 27 × 19 pixels: 4 × 3 tiles, partial on two borders.
 fn scene(n: usize, sh_degree: u32, dim: usize, seed: u64) -> Scene {
@@ -204,7 +205,7 @@ pub fn pairs(device: &Device) {
     let scene = scene(60, 0, 0, 1045);
     let (params, mut raster) = scene.upload(device);
     raster.forward(&params, &scene.options).unwrap();
-    let [evaluated, blended] = counting::count(device, &raster).unwrap();
+    let counting::Pairs { evaluated, blended, in_rows } = counting::count(device, &raster).unwrap();
     let forward = scene.reference();
     let reference = ReferenceScene {
         projected: &forward.projected,
@@ -213,10 +214,15 @@ pub fn pairs(device: &Device) {
         order: &forward.order,
         view: &scene.view,
     };
-    let pixels = (0..19).flat_map(|y| (0..27).map(move |x| (x, y)));
-    let expected: usize = pixels.map(|(x, y)| walk(&reference, &Cutoffs::STANDARD, x, y).0.len()).sum();
+    let (mut expected, mut rows) = (0, BTreeSet::new());
+    for (x, y) in (0..19).flat_map(|y| (0..27).map(move |x| (x, y))) {
+        let (list, _) = walk(&reference, &Cutoffs::STANDARD, x, y);
+        expected += list.len();
+        rows.extend(list.iter().map(|pair| (pair.splat, x / 8, y)));
+    }
     // f32 and f64 may disagree at the two thresholds for one pair.
     assert!((blended - expected as f64).abs() <= 1.0, "{blended} of {expected}");
+    assert!((in_rows - 8.0 * rows.len() as f64).abs() <= 8.0, "{in_rows} in {} rows", rows.len());
     let listed: usize = raster.tile_lists().unwrap().iter().map(Vec::len).sum();
     assert!(evaluated >= blended && evaluated <= 64.0 * listed as f64, "{evaluated} {listed}");
 }
