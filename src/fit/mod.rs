@@ -1,6 +1,8 @@
 //! Training: losses, schedules, pruning, pose refinement.
 mod added;
 mod bounds;
+#[cfg(test)]
+mod costs;
 mod degree_trials;
 mod densify;
 pub mod index_head;

@@ -20,7 +20,7 @@ use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
 /// Bits of the depth keys: those of camera z.
-pub(super) const DEPTH_BITS: u32 = 32;
+pub const DEPTH_BITS: u32 = 32;
 
 /// Records the projection of all splats to `frame.projected` and `frame.depth_pairs`, with the
 /// first (sh_degree + 1)² SH coefficients. Writes their number to `splat_count` and clears the

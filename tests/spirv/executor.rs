@@ -1,7 +1,7 @@
 //! Runs the programs of the engine on the interpreter: a device of any subgroup size.
-use spirv_interpreter::{GARBAGE, Memory, Schedule, Shader, words};
+use spirv_interpreter::{Counts, GARBAGE, Memory, Schedule, Shader, words};
 use splatvk::gpu::{Buffer, Executor, Groups, Module, NATIVE_FLOAT_ATOMICS, Op, Options, TestDevice};
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::{Arc, LazyLock, Mutex};
 
 /// Replacement for a shipped module; `None` keeps the module.
@@ -20,6 +20,8 @@ pub struct Interpreted {
     pub change: Option<Change>,
     /// Modules that have run, and scratch buffers that were used.
     pub ran: Arc<Mutex<BTreeSet<&'static str>>>,
+    /// Executed instructions by family.
+    pub counts: Arc<Mutex<BTreeMap<&'static str, Counts>>>,
 }
 
 impl Interpreted {
@@ -108,7 +110,11 @@ impl Executor for Interpreted {
                             [words[0], words[1], words[2]]
                         }
                     };
-                    self.dispatch(module, call.buffers(), call.push(), groups, k as u64, &mut buffers)?;
+                    let number = k as u64;
+                    let counts =
+                        self.dispatch(module, call.buffers(), call.push(), groups, number, &mut buffers)?;
+                    let family = module.name.split('[').next().unwrap_or_default();
+                    *self.counts.lock().unwrap().entry(family).or_default() += counts;
                 }
             }
         }
@@ -126,7 +132,7 @@ impl Interpreted {
         groups: [u32; 3],
         number: u64,
         buffers: &mut Buffers,
-    ) -> Result<(), String> {
+    ) -> Result<Counts, String> {
         self.ran.lock().unwrap().insert(module.name);
         let code = self.code(module);
         let used: Vec<&(u32, Buffer)> =

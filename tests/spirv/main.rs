@@ -2,6 +2,7 @@
 //! sizes that no available device has, with detection of faults that no driver reports. See
 //! docs/internals/trust.md#shaders-without-a-device.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)] // a panic is how a test fails
+mod costs;
 mod executor;
 mod mutations;
 mod operations;
@@ -38,8 +39,8 @@ const SCRATCH: &[&str] = &[
 
 fn interpreted(subgroup_size: usize, float_atomics: bool) -> Interpreted {
     let schedule = Schedule { subgroup_size, order: Order::Random, in_flight: 3, scattered: false, seed: 1 };
-    let ran = Arc::default();
-    Interpreted { schedule, float_atomics, max_binding: None, scratch: SCRATCH, change: None, ran }
+    let (ran, counts) = (Arc::default(), Arc::default());
+    Interpreted { schedule, float_atomics, max_binding: None, scratch: SCRATCH, change: None, ran, counts }
 }
 
 /// Runs a scene; returns the panic message if it fails.

@@ -1,6 +1,7 @@
 //! Scheduling of a dispatch: a number of workgroups at a time, in any order, each for a slice of
 //! its blocks.
 use crate::code::Code;
+use crate::counts::Counts;
 use crate::faults::Faults;
 use crate::memory::Memory;
 use crate::subgroup::{Dispatch, Group, Stop, Subgroup};
@@ -60,7 +61,7 @@ struct Running {
     ascending: bool,
 }
 
-/// Runs all workgroups; `Err` if one cannot continue.
+/// Runs all workgroups and counts their instructions; `Err` if one cannot continue.
 pub(crate) fn run(
     code: &Code,
     buffers: &mut [Option<Memory>],
@@ -68,7 +69,7 @@ pub(crate) fn run(
     groups: [u32; 3],
     schedule: &Schedule,
     faults: &mut Faults,
-) -> Result<(), String> {
+) -> Result<Counts, String> {
     let threads: u32 = code.workgroup.iter().product();
     buffers.iter_mut().flatten().for_each(|b| b.start(threads));
     let mut random = Random(schedule.seed);
@@ -80,7 +81,7 @@ pub(crate) fn run(
     }
     let mut running: Vec<Running> = Vec::new();
     let mut spare: Vec<Subgroup> = Vec::new();
-    let mut d = Dispatch { code, buffers, push, groups, faults };
+    let mut d = Dispatch { code, buffers, push, groups, faults, counts: Counts::default() };
     loop {
         while running.len() < schedule.in_flight.max(1)
             && let Some(number) = waiting.pop()
@@ -88,7 +89,7 @@ pub(crate) fn run(
             running.push(begin(&d, number, schedule, &mut spare, &mut random));
         }
         if running.is_empty() {
-            return Ok(());
+            return Ok(d.counts);
         }
         let k = random.below(running.len());
         if running[k].advance(&mut d, &mut random)? {

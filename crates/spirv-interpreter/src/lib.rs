@@ -44,6 +44,7 @@
 
 mod alu;
 mod code;
+mod counts;
 mod dispatch;
 mod faults;
 mod lower;
@@ -55,6 +56,7 @@ mod subgroup_ops;
 mod types;
 
 pub use code::GARBAGE;
+pub use counts::Counts;
 pub use dispatch::{Order, Random, Schedule};
 pub use faults::{Error, Fault, Found};
 pub use memory::Memory;
@@ -83,7 +85,7 @@ impl Shader {
     }
 
     /// Runs all workgroups. `buffers` are indexed by binding number; `push` has the words of the
-    /// push constants.
+    /// push constants. Returns the counts of the executed instructions.
     ///
     /// # Errors
     /// [`Error::Stuck`] if a barrier is not reached by all or a loop never ends, [`Error::Faulty`]
@@ -94,9 +96,10 @@ impl Shader {
         push: &[u32],
         groups: [u32; 3],
         schedule: &Schedule,
-    ) -> Result<(), Error> {
+    ) -> Result<Counts, Error> {
         let mut faults = faults::Faults::default();
-        dispatch::run(&self.0, buffers, push, groups, schedule, &mut faults).map_err(Error::Stuck)?;
-        faults.report()
+        let counts =
+            dispatch::run(&self.0, buffers, push, groups, schedule, &mut faults).map_err(Error::Stuck)?;
+        faults.report().map(|()| counts)
     }
 }

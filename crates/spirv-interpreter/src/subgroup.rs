@@ -3,6 +3,7 @@
 //! are at it.
 use crate::alu;
 use crate::code::{Code, Edge, End, GARBAGE, Inst, Place, Reg, Root, Step};
+use crate::counts::Counts;
 use crate::faults::{Fault, Faults};
 use crate::memory::{Accessor, Memory};
 use rspirv::spirv::BuiltIn;
@@ -25,6 +26,7 @@ pub struct Dispatch<'a> {
     pub push: &'a [u32],
     pub groups: [u32; 3],
     pub faults: &'a mut Faults,
+    pub counts: Counts,
 }
 
 /// State of a workgroup: position, memory, and numbers of barriers by the memory that they order.
@@ -122,6 +124,7 @@ impl Subgroup {
             let all = &code.blocks[block as usize];
             while let Some((inst, at)) = all.insts.get(self.pc) {
                 self.pc += 1;
+                d.counts.note(inst);
                 if let Inst::Barrier { semantics } = inst {
                     if self.active.len() != self.locals.len() {
                         let (here, of) = (self.active.len(), self.locals.len());
