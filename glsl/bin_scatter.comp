@@ -7,7 +7,7 @@ layout(std430, binding = 0) readonly buffer EntryCount { uint entry_count; };
 // [capacity] (tile, splat).
 layout(std430, binding = 1) readonly buffer Entries { uvec2 entries[]; };
 layout(std430, binding = 2) buffer Counters { uint counters[]; };  // [tiles, lanes] positions
-// [capacity] (splat, entry).
+// [capacity] (entry, splat).
 layout(std430, binding = 3) writeonly buffer TileSplats { uvec2 tile_splats[]; };
 // [lanes] first entry.
 layout(std430, binding = 4) readonly buffer LaneStarts { uint lane_starts[]; };
@@ -22,6 +22,6 @@ void main() {
         uvec2 entry = entries[i];
         uint at = entry.x * lanes + lane, place = counters[at];
         counters[at] = place + 1;
-        tile_splats[place] = uvec2(entry.y, i);
+        tile_splats[place] = uvec2(i, entry.y);
     }
 }

@@ -14,7 +14,7 @@ layout(local_size_x = SUBGROUP_SIZE) in;
 // [N, 3], see project.comp.
 layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };
 layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };  // [tiles + 1]
-// [capacity] (splat, entry).
+// [capacity] (entry, splat), see bin_ranges.comp.
 layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };
 // [rows, W] label set of each pixel, counted per tile from 0; -1 = none.
 layout(std430, binding = 3) readonly buffer Slots { int slots[]; };

@@ -31,6 +31,15 @@ layout(push_constant) uniform Push {
 #include "shared/splat.glsl"
 
 const float LOG2_E = 1.4426950408889634;
+// Depth keys have three digits of the radix sort: the bits of camera z from the near plane on, which
+// grow with z, without the last ones. Depths that differ by less than two millionths keep the order
+// of the splats; those beyond 4e9 times the near plane, too.
+const uint DEPTH_BITS = 24, DROPPED_BITS = 4;
+const uint HIDDEN_KEY = (1u << DEPTH_BITS) - 1u; // behind all others
+
+uint depth_key(float z) {
+    return min((floatBitsToUint(z) - floatBitsToUint(camera_near())) >> DROPPED_BITS, HIDDEN_KEY - 1u);
+}
 
 void main() {
     uint i = gl_GlobalInvocationID.x, threads = 64u * gl_NumWorkGroups.x;
@@ -61,6 +70,5 @@ void main() {
     projected[PROJECTED_VECTORS * i] = vec4(centre, power.xy);
     projected[PROJECTED_VECTORS * i + 1] = vec4(power.z, visible ? log2_opacity : -1e4, 0.25 * LOG2_E * LOG2_E * g.conic_det, 0.0);
     projected[PROJECTED_VECTORS * i + 2] = vec4(colour, g.t.z);
-    // Positive floats sort like their bits.
-    depth_pairs[i] = uvec2(visible ? floatBitsToUint(g.t.z) : 0xffffffffu, i);
+    depth_pairs[i] = uvec2(visible ? depth_key(g.t.z) : HIDDEN_KEY, i);
 }

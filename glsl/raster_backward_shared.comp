@@ -15,7 +15,7 @@ layout(local_size_x = SUBGROUP_SIZE) in;
 // [N, 3], see project.comp.
 layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };
 layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };  // [tiles + 1]
-// [capacity] (splat, entry).
+// [capacity] (entry, splat), see bin_ranges.comp.
 layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };
 layout(std430, binding = 3) readonly buffer Planes { float planes[]; };  // [4 + d, H, W]
 // [4 + d + 1, H, W], alpha last.
@@ -148,7 +148,7 @@ void main() {
                 float low = sums[at], high = sums[at + 2];
                 sums[at] = select(upper, high, low) + subgroupShuffleXor(select(upper, low, high), 2);
             }
-            uint target = subgroupShuffle(own_item.x, i);
+            uint target = subgroupShuffle(own_item.y, i);
             [[unroll]] for (int n = 0; n < GRADIENT_VECTORS; n++) {
                 float low = sums[TILE_PARTS * n], high = sums[TILE_PARTS * n + 1];
                 float sum = select(odd, high, low) + subgroupShuffleXor(select(odd, low, high), 1);

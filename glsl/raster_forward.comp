@@ -13,7 +13,7 @@ layout(local_size_x = SUBGROUP_SIZE) in;
 // [N, 3], see project.comp.
 layout(std430, binding = 1) readonly buffer Projected { vec4 projected[]; };
 layout(std430, binding = 2) readonly buffer TileRanges { uint tile_ranges[]; };  // [tiles + 1]
-// [capacity] (splat, entry).
+// [capacity] (entry, splat), see bin_ranges.comp.
 layout(std430, binding = 3) readonly buffer TileSplats { uvec2 tile_splats[]; };
 #if CHANNELS != BASE_CHANNELS
 layout(std430, binding = 4) readonly buffer Codes { vec4 codes[]; };  // [N, code_vectors]

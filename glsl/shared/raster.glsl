@@ -36,7 +36,7 @@
 #define SHARED_BATCHES 2
 #endif
 
-// (splat, entry) of this lane in the batch.
+// (entry, splat) of this lane in the batch.
 uvec2 own_item;
 
 #if SHARED_SPLATS
@@ -52,16 +52,16 @@ vec4 values[VALUE_VECTORS];
 
 void fetch(uint at, uint last) {
     next_item = tile_splats[min(at, last - 1)];
-    next_splat[0] = projected[PROJECTED_VECTORS * next_item.x];
-    next_splat[1] = projected[PROJECTED_VECTORS * next_item.x + 1];
+    next_splat[0] = projected[PROJECTED_VECTORS * next_item.y];
+    next_splat[1] = projected[PROJECTED_VECTORS * next_item.y + 1];
 #if BASE
-    next_splat[2] = projected[PROJECTED_VECTORS * next_item.x + 2];
+    next_splat[2] = projected[PROJECTED_VECTORS * next_item.y + 2];
 #endif
 #if FEATURES > 0
     [[unroll]] for (int k = 0; k < FEATURE_VECTORS; k++) {
         uint from = uint(k) + first_vector;
         next_splat[SPLAT_VECTORS - FEATURE_VECTORS + k] =
-            from < code_vectors ? codes[next_item.x * code_vectors + from] : vec4(0.0);
+            from < code_vectors ? codes[next_item.y * code_vectors + from] : vec4(0.0);
     }
 #endif
 }
@@ -99,7 +99,7 @@ void begin_batches(uint first, uint last, uint lane) {}
 
 void load_batch(uint j, uint last, uint lane) {
     own_item = tile_splats[min(j + lane, last - 1)];
-    uint splat = own_item.x;
+    uint splat = own_item.y;
     vec4 p = projected[PROJECTED_VECTORS * splat], q = projected[PROJECTED_VECTORS * splat + 1];
     own_u = p.x;
     own_v = p.y;

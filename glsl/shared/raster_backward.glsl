@@ -11,7 +11,7 @@ layout(local_size_x = SUBGROUP_SIZE) in;
 // [N, 3], see project.comp.
 layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };
 layout(std430, binding = 1) readonly buffer TileRanges { uint tile_ranges[]; };  // [tiles + 1]
-// [capacity] (splat, entry).
+// [capacity] (entry, splat), see bin_ranges.comp.
 layout(std430, binding = 2) readonly buffer TileSplats { uvec2 tile_splats[]; };
 #if CHANNELS != BASE_CHANNELS
 layout(std430, binding = 3) readonly buffer Codes { vec4 codes[]; };  // [N, code_vectors]
@@ -108,31 +108,31 @@ void evaluate(uint i, vec2 origin) {
     }
 }
 
-// Stores or adds the sums of one (splat, entry).
+// Stores or adds the sums of one (entry, splat).
 void store_gradients(uvec2 item, float sums[VALUES]) {
 #if BY_ENTRY
 #if BASE
-    splat_entries[GRADIENT_VECTORS * item.y] = vec4(sums[0], sums[1], sums[2], sums[3]);
-    splat_entries[GRADIENT_VECTORS * item.y + 1] = vec4(sums[4], sums[5], sums[6], sums[7]);
-    splat_entries[GRADIENT_VECTORS * item.y + 2] = vec4(sums[8], sums[9], 0.0, 0.0);
+    splat_entries[GRADIENT_VECTORS * item.x] = vec4(sums[0], sums[1], sums[2], sums[3]);
+    splat_entries[GRADIENT_VECTORS * item.x + 1] = vec4(sums[4], sums[5], sums[6], sums[7]);
+    splat_entries[GRADIENT_VECTORS * item.x + 2] = vec4(sums[8], sums[9], 0.0, 0.0);
 #else
-    splat_entries[GRADIENT_VECTORS * item.y] += vec4(sums[0], sums[1], sums[2], sums[3]);
-    splat_entries[GRADIENT_VECTORS * item.y + 1] += vec4(sums[4], sums[5], 0.0, 0.0);
+    splat_entries[GRADIENT_VECTORS * item.x] += vec4(sums[0], sums[1], sums[2], sums[3]);
+    splat_entries[GRADIENT_VECTORS * item.x + 1] += vec4(sums[4], sums[5], 0.0, 0.0);
 #endif
 #if FEATURES > 0
     [[unroll]] for (int k = 0; k < FEATURE_VECTORS; k++) {
         vec4 f = vec4(0.0);
         [[unroll]] for (int n = 0; n < 4; n++)
             if (4 * k + n < FEATURES) f[n] = sums[VALUES - FEATURES + 4 * k + n];
-        code_entries[item.y * FEATURE_VECTORS + k] = f;
+        code_entries[item.x * FEATURE_VECTORS + k] = f;
     }
 #endif
 #else
-    [[unroll]] for (int n = 0; n < VALUES - FEATURES; n++) ATOMIC_ADD(projected_grad[GRADIENT_FLOATS * item.x + n], sums[n]);
+    [[unroll]] for (int n = 0; n < VALUES - FEATURES; n++) ATOMIC_ADD(projected_grad[GRADIENT_FLOATS * item.y + n], sums[n]);
 #if FEATURES > 0
     [[unroll]] for (int n = 0; n < FEATURES; n++) {
         float sum = select(n < features, sums[VALUES - FEATURES + n], 0.0);
-        ATOMIC_ADD(codes_grad[4 * (item.x * code_vectors + first_vector) + min(n, features - 1)], sum);
+        ATOMIC_ADD(codes_grad[4 * (item.y * code_vectors + first_vector) + min(n, features - 1)], sum);
     }
 #endif
 #endif

@@ -127,9 +127,10 @@ fn group_by_counting(
 fn record_sorting(rec: &mut Recorder, frame: &FrameBuffers, rows: &Range<u32>, count: u32, group: &Sorting) {
     let (tiles_x, lists) = (frame.tiles()[0], &frame.lists);
     let (first_row, end_row, tiles) = (rows.start, rows.end, tiles_x * (rows.end - rows.start));
-    let (entries, capacity) = (&lists.entries, lists.capacity as u32);
+    let capacity = lists.capacity as u32;
     let Sorting { large_splats, entry_splats, sort } = group;
     let bits = tile_bits(tiles);
+    let entries = sort.unsorted(&lists.entries, bits);
     let (zeros, _) = sort.zeros(bits);
     let (first_digit, passes) = sort.digits(bits);
     // Only sums per entry need its index: otherwise the sort moves the splats themselves.
@@ -165,12 +166,12 @@ fn record_sorting(rec: &mut Recorder, frame: &FrameBuffers, rows: &Range<u32>, c
         &shaders::bin_large::Push { tiles_x, first_row, end_row, capacity, first_digit, passes, most },
     );
     rec.dispatch(call, [most.clamp(1, LARGE_GROUPS), 1, 1]);
-    let sorted = sort.record_prepared(rec, entries, &lists.entry_count, bits, Prepared::Counted);
+    sort.record_prepared(rec, &lists.entries, &lists.entry_count, bits, Prepared::Counted);
     let call = shaders::bin_ranges::call(
         shaders::bin_ranges::Variant { indexed },
         &shaders::bin_ranges::Bindings {
             entry_count: &lists.entry_count,
-            entries: sorted,
+            entries: &lists.entries,
             tile_ranges: &lists.ranges,
             tile_splats: &lists.splats,
             entry_splats,

@@ -129,7 +129,7 @@ impl LabelSets {
             let sets = self.sets[first + list].chunks_exact(self.levels).skip(first_slot).take(SLOTS);
             for (slot, set) in sets.enumerate() {
                 for entry in range[0] as usize..range[1] as usize {
-                    sums.add(listed[2 * entry] as usize, set, weights[SLOTS * entry + slot]);
+                    sums.add(listed[2 * entry + 1] as usize, set, weights[SLOTS * entry + slot]);
                 }
             }
         }

@@ -19,11 +19,11 @@ use crate::gpu::{Buffer, Recorder, shaders};
 use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
-/// Bits of the depth keys: those of camera z.
-pub const DEPTH_BITS: u32 = 32;
+/// Bits of the depth keys.
+pub const DEPTH_BITS: u32 = shaders::project::DEPTH_BITS;
 
-/// Records the projection of all splats to `frame.projected` and `frame.depth_pairs`, with the
-/// first (sh_degree + 1)² SH coefficients. Writes their number to `splat_count` and clears the
+/// Records the projection of all splats to `frame.projected`, with the
+/// first (sh_degree + 1)² SH coefficients, and of their depth keys for `sort`. Writes their number to `splat_count` and clears the
 /// counters of `sort` and of the tile lists.
 pub(super) fn record(
     rec: &mut Recorder,
@@ -46,7 +46,7 @@ pub(super) fn record(
             opacity_logits: &splats.opacity_logits,
             sh: &splats.sh,
             projected: &frame.projected,
-            depth_pairs: &frame.depth_pairs,
+            depth_pairs: sort.unsorted(&frame.depth_pairs, DEPTH_BITS),
             splat_count,
             sort_zeros,
             list_zeros,

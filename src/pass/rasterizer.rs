@@ -178,7 +178,7 @@ impl Rasterizer {
             codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
             codes_grad: device.buffer::<f32>("codes_grad", (stride * splats).max(4))?,
             depth_pairs: device.buffer::<u32>("depth_pairs", 2 * splats)?,
-            lists: TileLists::new(device, choices.grouping, splats, tiles, entries)?,
+            lists: TileLists::new(device, choices.grouping, choices.summation, splats, tiles, entries)?,
         };
         let camera = device.buffer::<CameraView>("camera", 1)?;
         let sort = Sort::new(device, splats)?;
@@ -274,11 +274,9 @@ impl Rasterizer {
         project::record(rec, params, &self.camera, &self.frame, sh_degree, sort);
         project::record_features(rec, params, &self.frame, options.feature_mode);
         rec.pass("depth sort");
-        // Keys are the bits of camera z. The sort is stable: equal depths keep the order of the
-        // splats.
+        // The sort is stable: equal keys keep the order of the splats.
         let pairs = &self.frame.depth_pairs;
-        let sorted = self.sort.record_prepared(rec, pairs, &self.count, DEPTH_BITS, Prepared::Cleared);
-        debug_assert_eq!(sorted.id(), pairs.id(), "an even number of passes sorts in place");
+        self.sort.record_prepared(rec, pairs, &self.count, DEPTH_BITS, Prepared::Cleared);
     }
 
     /// Records binning and blending of a band. In a recording, band 0 directly follows
@@ -506,7 +504,8 @@ impl Rasterizer {
             self.strip = ((u64::from(strip) * most as u64 / wanted as u64) as u32).max(1);
         }
         let capacity = wanted.min(most);
-        self.frame.lists = TileLists::new(&self.device, self.grouping, splats, tiles, capacity)?;
+        let summation = self.frame.summation;
+        self.frame.lists = TileLists::new(&self.device, self.grouping, summation, splats, tiles, capacity)?;
         Ok(self.frame.status.write(&[0; 3])?)
     }
 
@@ -515,8 +514,9 @@ impl Rasterizer {
     pub fn tile_lists(&self) -> Result<Vec<Vec<u32>>> {
         let ranges = self.frame.lists.ranges.read_range(0..tiles_of(&self.frame.bands) + 1)?;
         let splats = self.frame.lists.splats.read()?;
-        let list =
-            |r: &[u32]| splats[2 * r[0] as usize..2 * r[1] as usize].iter().step_by(2).copied().collect();
+        let list = |r: &[u32]| {
+            splats[2 * r[0] as usize..2 * r[1] as usize].iter().skip(1).step_by(2).copied().collect()
+        };
         Ok(ranges.windows(2).map(list).collect())
     }
 

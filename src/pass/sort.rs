@@ -71,6 +71,10 @@ impl Key {
         let mask = if bits == 32 { u32::MAX } else { (1 << bits) - 1 };
         Key { mask, passes: bits.div_ceil(DIGIT_BITS) }
     }
+
+    fn is_odd(self) -> bool {
+        !self.passes.is_multiple_of(2)
+    }
 }
 
 /// Work that the passes before a sort did for it.
@@ -148,30 +152,47 @@ impl Sort {
         if let Work::Sweep { .. } = &self.work {
             rec.fill(&self.zeros, 0);
         }
-        let sorted = self.record_prepared(rec, pairs, count, bits, Prepared::Cleared);
-        if sorted.id() != pairs.id() {
-            rec.copy_bytes(sorted, 0, pairs, 0, pairs.bytes());
+        let key = Key::new(bits);
+        self.record_passes(rec, [pairs, &self.scratch], count, key, Prepared::Cleared);
+        if key.is_odd() {
+            rec.copy_bytes(&self.scratch, 0, pairs, 0, pairs.bytes());
         }
     }
 
-    /// [`Sort::record`] after other preparation, and without a copy: returns the buffer that holds
-    /// the sorted pairs, `pairs` or the scratch buffer.
-    pub(super) fn record_prepared<'a>(
-        &'a self,
+    /// The buffer that holds the pairs before [`Sort::record_prepared`] sorts them to `pairs`.
+    pub(super) fn unsorted<'a>(&'a self, pairs: &'a Buffer<u32>, bits: u32) -> &'a Buffer<u32> {
+        if Key::new(bits).is_odd() { &self.scratch } else { pairs }
+    }
+
+    /// [`Sort::record`] after other preparation, from [`Sort::unsorted`] to `pairs` without a copy.
+    pub(super) fn record_prepared(
+        &self,
         rec: &mut Recorder,
-        pairs: &'a Buffer<u32>,
+        pairs: &Buffer<u32>,
         count: &Buffer<u32>,
         bits: u32,
         prepared: Prepared,
-    ) -> &'a Buffer<u32> {
-        if pairs.bytes() > self.scratch.bytes() {
-            rec.fail(format!("sort: `{}` has more pairs than the capacity of the sort", pairs.name()));
-        }
+    ) {
         let key = Key::new(bits);
-        if let (Work::Sweep { .. }, Prepared::Cleared) = (&self.work, prepared) {
-            self.record_digits(rec, pairs, count, key);
+        let buffers = if key.is_odd() { [&self.scratch, pairs] } else { [pairs, &self.scratch] };
+        self.record_passes(rec, buffers, count, key, prepared);
+    }
+
+    /// Records the passes from the first of two buffers, each to the other one.
+    fn record_passes(
+        &self,
+        rec: &mut Recorder,
+        [mut from, mut to]: [&Buffer<u32>; 2],
+        count: &Buffer<u32>,
+        key: Key,
+        prepared: Prepared,
+    ) {
+        if from.bytes().max(to.bytes()) > self.scratch.bytes() {
+            rec.fail("sort: more pairs than the capacity of the sort");
         }
-        let (mut from, mut to) = (pairs, &self.scratch);
+        if let (Work::Sweep { .. }, Prepared::Cleared) = (&self.work, prepared) {
+            self.record_digits(rec, from, count, key);
+        }
         for pass in 0..key.passes {
             match &self.work {
                 Work::Chunks { histogram, lanes } => {
@@ -181,7 +202,6 @@ impl Sort {
             }
             (from, to) = (to, from);
         }
-        from
     }
 
     /// Records the digit histograms of all passes.

@@ -1,4 +1,5 @@
 //! Memory of the tile lists of [`super::bin`].
+use super::frame::GradientReduction;
 use super::scan::Scan;
 use super::sort::{Sort, SortAlgorithm};
 use crate::Result;
@@ -31,11 +32,12 @@ impl TileBinning {
 pub(super) struct TileLists {
     /// [tiles + 1] starts of the lists.
     pub ranges: Buffer<u32>,
-    /// [capacity] (splat, entry), grouped by tile, nearest first.
+    /// [capacity] (entry, splat), grouped by tile, nearest first; without entries, the sorted
+    /// `entries` themselves, (tile, splat).
     pub splats: Buffer<u32>,
-    /// [N] number of entries of each splat, in depth order.
+    /// [N] number of entries of each splat, in depth order, where a pass needs it.
     pub counts: Buffer<u32>,
-    /// [N] first entry of each splat, in depth order.
+    /// [N] first entry of each splat, in depth order, where a pass needs it.
     pub starts: Buffer<u32>,
     /// [1] entries of this frame, 0 when they did not fit.
     pub entry_count: Buffer<u32>,
@@ -66,7 +68,7 @@ pub(super) struct Counting {
 pub(super) struct Sorting {
     /// [capacity / LARGE] (splat, first entry).
     pub large_splats: Buffer<u32>,
-    /// [capacity] splat of each entry.
+    /// [capacity] splat of each entry, where lists have entries.
     pub entry_splats: Buffer<u32>,
     /// Its zeros begin with those of `glsl/bin_sweep.comp`.
     pub sort: Sort,
@@ -88,10 +90,15 @@ impl TileLists {
     pub fn new(
         device: &Device,
         grouping: TileBinning,
+        summation: GradientReduction,
         splats: usize,
         tiles: usize,
         capacity: usize,
     ) -> Result<TileLists> {
+        // Sums of the atomics need no entries.
+        let indexed = grouping == TileBinning::Counting || summation == GradientReduction::Entries;
+        let if_indexed = |count: usize| if indexed { count } else { 1 };
+        let entries = device.buffer::<u32>("entries", 2 * capacity)?;
         let group = match grouping {
             TileBinning::Counting => {
                 let lanes = counting_lanes(tiles, capacity + splats, device.info().max_storage_range);
@@ -105,20 +112,23 @@ impl TileLists {
                 let large = 2 * (capacity / shaders::bin_sweep::LARGE as usize).max(1);
                 Group::Sorting(Sorting {
                     large_splats: device.buffer::<u32>("large splats", large)?,
-                    entry_splats: device.buffer::<u32>("entry splats", capacity)?,
+                    entry_splats: device.buffer::<u32>("entry splats", if_indexed(capacity))?,
                     sort: Sort::with_room(device, capacity, SortAlgorithm::of(device), room)?,
                 })
             }
         };
         Ok(TileLists {
             ranges: device.buffer::<u32>("tile_ranges", tiles + 1)?,
-            splats: device.buffer::<u32>("tile_splats", 2 * capacity)?,
-            counts: device.buffer::<u32>("tile_counts", splats)?,
-            starts: device.buffer::<u32>("tile_starts", splats)?,
+            splats: match indexed {
+                true => device.buffer::<u32>("tile_splats", 2 * capacity)?,
+                false => entries.clone(),
+            },
+            counts: device.buffer::<u32>("tile_counts", if_indexed(splats))?,
+            starts: device.buffer::<u32>("tile_starts", if_indexed(splats))?,
             entry_count: device.buffer::<u32>("entry_count", 1)?,
             capacity,
             tiles: tiles as u32,
-            entries: device.buffer::<u32>("entries", 2 * capacity)?,
+            entries,
             group,
         })
     }

@@ -278,7 +278,7 @@ pub(super) fn scatter(call: &mut NativeCall) -> Result<(), String> {
             unsafe {
                 let place = counters.get(at);
                 counters.set(at, place + 1);
-                splats.set(place as usize, [splat, i]);
+                splats.set(place as usize, [i, splat]);
             }
         }
     });

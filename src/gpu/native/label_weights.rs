@@ -51,7 +51,7 @@ fn sums_of<S: Simd>(
 ) -> Vec<Weights> {
     // Entries behind the last splat that any pixel sees are 0.
     let mut sums = vec![Weights::default(); list.len()];
-    for (sum, [splat, _]) in sums.iter_mut().zip(list) {
+    for (sum, [_, splat]) in sums.iter_mut().zip(list) {
         let splat = Splat::of(&projected[*splat as usize], &[], false);
         *sum = label_weights(simd, &splat, at, &mut pixels, slots);
         if pixels.open == 0 {

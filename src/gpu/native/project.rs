@@ -1,6 +1,7 @@
 //! `project.comp`.
 use super::splat::{Camera, Geometry};
 use crate::gpu::NativeCall;
+use crate::gpu::shaders::project::{DEPTH_BITS, DROPPED_BITS};
 use crate::gpu::shaders::shared::cutoffs::LOG2_ALPHA_MIN;
 use crate::gpu::shaders::shared::layout::PROJECTED_FLOATS;
 use crate::gpu::shaders::structs::CameraView;
@@ -10,6 +11,13 @@ use rayon::prelude::*;
 use std::f32::consts::LOG2_E;
 
 const FLOATS: usize = PROJECTED_FLOATS as usize;
+
+/// Key of splats that nothing shows, behind all others.
+const HIDDEN_KEY: u32 = (1 << DEPTH_BITS) - 1;
+
+fn depth_key(z: f32, near: f32) -> u32 {
+    ((z.to_bits() - near.to_bits()) >> DROPPED_BITS).min(HIDDEN_KEY - 1)
+}
 
 pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
     let [count, sh_stride, antialiased, sort_words, list_words] = call.words()?.map(|word| word as usize);
@@ -55,7 +63,7 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
             colour.z,
             g.t.z,
         ];
-        *pair = [if visible { g.t.z.to_bits() } else { u32::MAX }, i as u32];
+        *pair = [if visible { depth_key(g.t.z, camera.near) } else { HIDDEN_KEY }, i as u32];
     });
     Ok(())
 }

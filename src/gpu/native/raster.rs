@@ -80,7 +80,7 @@ fn forward_with<const C: usize>(call: &mut NativeCall) -> Result<(), String> {
 fn blended<S: Simd, const C: usize>(simd: S, tile: &Tile, list: &[[u32; 2]], of: &[Splat<C>]) -> Blended<C> {
     let mut state = Blended { pixels: tile.pixels(), channels: [[[0.0; EDGE]; C]; EDGE] };
     let at = [tile.x as f32, tile.y as f32];
-    for [splat, _] in list {
+    for [_, splat] in list {
         blend(simd, &of[*splat as usize], at, &mut state);
         if state.pixels.open == 0 {
             break;
@@ -236,7 +236,7 @@ fn differentiate<S: Simd, const C: usize>(
     gathered: &mut Gathered<C>,
 ) {
     let at = [tile.x as f32, tile.y as f32];
-    for &[splat, _] in list {
+    for &[_, splat] in list {
         gradients(simd, &of[splat as usize], at, coupled, state, gathered.of(splat));
         if state.pixels.open == 0 {
             break;
@@ -257,7 +257,7 @@ pub(super) fn count_pairs(call: &mut NativeCall) -> Result<(), String> {
         for (tile, counts) in rows.tiles(groups, row).zip(counts.chunks_exact_mut(EDGE * EDGE)) {
             let (mut pixels, mut sums) = (tile.pixels(), [0; 3]);
             let at = [tile.x as f32, tile.y as f32];
-            for [splat, _] in &splats[ranges[tile.list] as usize..ranges[tile.list + 1] as usize] {
+            for [_, splat] in &splats[ranges[tile.list] as usize..ranges[tile.list + 1] as usize] {
                 let splat = Splat::of(&projected[*splat as usize], &[], false);
                 dispatch!(level, simd => count(simd, &splat, at, &mut pixels, &mut sums));
                 if pixels.open == 0 {
