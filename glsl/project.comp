@@ -31,14 +31,19 @@ layout(push_constant) uniform Push {
 #include "shared/splat.glsl"
 
 const float LOG2_E = 1.4426950408889634;
-// Depth keys have three digits of the radix sort: the bits of camera z from the near plane on, which
-// grow with z, without the last ones. Depths that differ by less than two millionths keep the order
-// of the splats; those beyond 4e9 times the near plane, too.
-const uint DEPTH_BITS = 24, DROPPED_BITS = 4;
-const uint HIDDEN_KEY = (1u << DEPTH_BITS) - 1u; // behind all others
+// Depth keys have three digits of the radix sort: the bits of camera z, which grow with z, without
+// the last 4 in the octaves from 1/256 to 65536, and without the last 9 elsewhere. Depths that differ
+// by less than two millionths (60 elsewhere) keep the order of the splats.
+const uint DEPTH_BITS = 24;
+const uint HIDDEN_KEY = 16777215; // behind all others
+const uint FINE_FIRST = 998244352, FINE_END = 1199570944; // bits of 1/256 and 65536
+const uint FINE_DROPPED = 4, COARSE_DROPPED = 9;
 
 uint depth_key(float z) {
-    return min((floatBitsToUint(z) - floatBitsToUint(camera_near())) >> DROPPED_BITS, HIDDEN_KEY - 1u);
+    uint bits = floatBitsToUint(z);
+    uint below = min(bits, FINE_FIRST), above = max(bits, FINE_END) - FINE_END;
+    uint fine = clamp(bits, FINE_FIRST, FINE_END) - FINE_FIRST;
+    return (below >> COARSE_DROPPED) + (fine >> FINE_DROPPED) + (above >> COARSE_DROPPED);
 }
 
 void main() {

@@ -17,10 +17,12 @@ layout(std430, binding = 3) readonly buffer Cross { float cross_slopes[]; };  //
 #endif
 // [C, H, W]: the first planes of the upstream stack.
 layout(std430, binding = 4) writeonly buffer Gradient { float gradient[]; };
-// [C, strips, W] sum of |x-y| over each strip.
+// From first_sum on [C, strips, W] sum of |x-y| over each strip.
 layout(std430, binding = 5) writeonly buffer Sums { float sums[]; };
 // Rows outside first .. end belong to other bands of the image: no gradient, no loss.
-layout(push_constant) uniform Push { int width; int height; float l1_weight; float dssim_weight; int first; int end; int weighted; };
+layout(push_constant) uniform Push {
+    int width; int height; float l1_weight; float dssim_weight; int first; int end; int weighted; int first_sum;
+};
 #include "shared/ssim.glsl"
 
 void main() {
@@ -64,5 +66,5 @@ void main() {
             sum += counts ? abs(u - v) : 0.0;
         }
     }
-    sums[(channel * int(gl_NumWorkGroups.y) + int(gl_WorkGroupID.y)) * width + x] = sum;
+    sums[first_sum + (channel * int(gl_NumWorkGroups.y) + int(gl_WorkGroupID.y)) * width + x] = sum;
 }

@@ -14,6 +14,7 @@ use crate::pass::plane_sweep::{GpuMatcher, Matcher, ReferenceView, SourceView};
 use crate::pass::plane_sweep_cpu::CpuMatcher;
 use crate::pass::query_peaks::DeviceSearch;
 use crate::pass::ssim_l1::{self, SsimL1, SsimRowKernel};
+use crate::pass::sum::{self, PARTIALS};
 use crate::query::frame::{FrameSearch, HostSearch, LevelPeaks, Table};
 use crate::query::maps::CodeMaps;
 use crate::scene::Image;
@@ -60,13 +61,13 @@ fn ssim_l1(device: &Device, rows: SsimRowKernel) -> Found {
         let planes = if weighted { [&y[..], &weights].concat() } else { y.clone() };
         let target = device.buffer_from("target", &planes)?;
         let gradient = device.buffer::<f32>("gradient", 3 * w * h)?;
-        let sums = device.buffer::<f32>("loss", 4)?;
+        let sums = device.buffer::<f32>("loss", 3 * PARTIALS)?;
         let mut rec = Recorder::new(device, "self-check of the image loss");
         let band = (&bands, &bands.get(0));
         pass.record(&mut rec, band, &rendered, &target, &gradient, covered, [0.8, dssim], (&sums, 1));
         rec.run()?;
         let sums = sums.read()?;
-        let loss = ssim_l1::ImageLoss::of(&bands, [sums[1], sums[2]].map(f64::from), covered);
+        let loss = ssim_l1::ImageLoss::of(&bands, [1, 2].map(|slot| sum::total(&sums, slot)), covered);
         let (reference, by_pixel) =
             ssim_l1::ssim_l1_weighted(&wide(&x), &wide(&y), &wide(&weights), w, h, 0.8, dssim);
         let largest = by_pixel.iter().fold(0.0f64, |m, g| m.max(g.abs()));

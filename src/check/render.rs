@@ -283,8 +283,8 @@ fn regularisers(device: &Device) -> Found {
     let n = scene.splats.len();
     let needles = RatioPenalty { weight: 0.25, limit: 2.0 };
     let mut rec = Recorder::new(device, "self-check of the regularisers");
-    regularise::record_depth(&mut rec, frame, Some(&reference), 0.5);
-    regularise::record_alpha(&mut rec, frame, &wanted_alpha, 0.5);
+    let (depth_term, alpha_term) = (Some((&reference, 0.5)), Some((&wanted_alpha, 0.5)));
+    regularise::record_depth_and_alpha(&mut rec, frame, depth_term, alpha_term);
     regularise::record_ratio(&mut rec, &params.log_scales, &gradients.log_scales, n, needles);
     rec.run()?;
 
@@ -318,7 +318,7 @@ fn regularisers(device: &Device) -> Found {
     let scale = close("by log scale", &scales, &by_scale, &tolerance);
     // Without a reference both become zero.
     let mut rec = Recorder::new(device, "self-check of the regularisers");
-    regularise::record_depth(&mut rec, frame, None, 0.5);
+    regularise::record_depth_and_alpha(&mut rec, frame, None, None);
     rec.run()?;
     let upstream = frame.planes_grad.read()?;
     let zero =

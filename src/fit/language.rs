@@ -183,7 +183,6 @@ pub(crate) struct Run<'a> {
     targets: CodeTargets,
     /// Language loss per pixel of a band.
     loss: Buffer<f32>,
-    partials: Buffer<f32>,
     /// Reliability per level, [N].
     reliability: Vec<Vec<f32>>,
     /// Losses since the last measurement.
@@ -237,7 +236,6 @@ impl<'a> Run<'a> {
             extent: scale.extent,
             targets,
             loss,
-            partials: device.buffer::<f32>("loss partials", sum::PARTIALS)?,
             reliability,
             recent: Vec::new(),
             curve: Vec::new(),
@@ -347,14 +345,13 @@ impl Training for Run<'_> {
                     sums,
                 );
                 if let Some((alpha, weight)) = &item.alpha {
-                    let weight = self.options.image_weight * weight;
-                    regularise::record_depth(&mut rec, frame, None, 0.0);
-                    regularise::record_alpha(&mut rec, frame, &alpha[band.index], weight);
+                    let alpha = (&alpha[band.index], self.options.image_weight * weight);
+                    regularise::record_depth_and_alpha(&mut rec, frame, None, Some(alpha));
                 }
             }
             codes::record(&mut rec, &self.targets.of(view, &band), frame, &self.loss);
-            let (loss, sums) = ((&self.loss, item.bands.pixels()), (&views.sums, slot(&band) + LANGUAGE_SUM));
-            sum::record(&mut rec, loss, &self.partials, sums);
+            let sums = (&views.sums, slot(&band) + LANGUAGE_SUM);
+            sum::record(&mut rec, &self.loss, (0..item.bands.pixels(), None), sums);
             rasterizer.record_band_backward(&mut rec, &model.values, raster, &band);
         }
         if !self.options.detach_geometry {

@@ -63,16 +63,14 @@ impl Losses {
         let bands = (&item.bands, band);
         views.loss.record(rec, bands, planes, target, gradient, item.covered, weights, sums);
         // A view without depth clears the gradients of another view.
-        let (reference, weight) = match (&self.depth, &item.depth) {
+        let depth = match (&self.depth, &item.depth) {
             (Some(weight), Some((references, count))) => {
-                (Some(&references[band.index]), weight / *count as f64)
+                Some((&references[band.index], weight / *count as f64))
             }
-            _ => (None, 0.0),
+            _ => None,
         };
-        regularise::record_depth(rec, frame, reference, weight);
-        if let Some((alpha, weight)) = &item.alpha {
-            regularise::record_alpha(rec, frame, &alpha[band.index], *weight);
-        }
+        let alpha = item.alpha.as_ref().map(|(alpha, weight)| (&alpha[band.index], *weight));
+        regularise::record_depth_and_alpha(rec, frame, depth, alpha);
     }
 
     /// Penalty on the needles among `count` splats, whose gradient the update adds to those of the

@@ -3,6 +3,7 @@ use crate::gpu::{self, Buffer, Device};
 use crate::pass::bands::{Band, Bands};
 use crate::pass::metrics::planar;
 use crate::pass::ssim_l1::SsimL1;
+use crate::pass::sum::{self, PARTIALS};
 use crate::pass::view::View;
 use crate::pass::{FrameBuffers, RasterOptions, Rasterizer};
 use crate::scene::{Camera, DepthMap, Outside, RgbImage};
@@ -36,7 +37,7 @@ pub(super) struct Views {
     pub(super) list: Vec<TrainView>,
     pub(super) raster: Rasterizer,
     pub(super) loss: SsimL1,
-    /// Per band Σ|x−y|, ΣSSIM, language loss, unused: [`SUMS`] floats.
+    /// Per band Σ|x−y|, ΣSSIM, language loss, unused: [`SUMS`] sums in [`PARTIALS`] parts each.
     pub(super) sums: Buffer<f32>,
     near: f64,
 }
@@ -44,7 +45,7 @@ pub(super) struct Views {
 /// Loss sums of a band.
 const SUMS: usize = 4;
 
-/// Slot of the first sum of a band.
+/// Slot of the first sum of a band ([`crate::pass::sum`]).
 pub(super) fn slot(band: &Band) -> u32 {
     (SUMS * band.index) as u32
 }
@@ -75,7 +76,7 @@ impl Views {
         let bands: Vec<Bands> = list.iter().map(|view| view.bands.clone()).collect();
         let most_bands = bands.iter().map(Bands::count).max().unwrap_or(0);
         let loss = SsimL1::new(device, &bands)?;
-        let sums = device.buffer::<f32>("loss sums", SUMS * most_bands)?;
+        let sums = device.buffer::<f32>("loss sums", PARTIALS * SUMS * most_bands)?;
         Ok(Views { list, raster, loss, sums, near })
     }
 
@@ -91,8 +92,9 @@ impl Views {
 
     /// The [`SUMS`] sums of the last step, on `view`, added up over its bands.
     pub(super) fn total(&self, view: usize) -> Result<[f64; SUMS]> {
-        let sums = self.sums.read_range(0..SUMS * self.list[view].bands.count())?;
-        Ok(std::array::from_fn(|k| sums.iter().skip(k).step_by(SUMS).map(|v| f64::from(*v)).sum()))
+        let bands = self.list[view].bands.count();
+        let sums = self.sums.read_range(0..PARTIALS * SUMS * bands)?;
+        Ok(std::array::from_fn(|k| (0..bands).map(|band| sum::total(&sums, SUMS * band + k)).sum()))
     }
 
     /// Sets size and camera of the next recording and run on a view.

@@ -22,6 +22,16 @@ use glam::{DMat3, DVec3, DVec4};
 /// Bits of the depth keys.
 pub const DEPTH_BITS: u32 = shaders::project::DEPTH_BITS;
 
+/// Sort key of a visible splat: the bits of camera z without the last ones, so that it grows with z
+/// and is equal where depths differ by less than two millionths.
+pub fn depth_key(z: f32) -> u32 {
+    use shaders::project::{COARSE_DROPPED, FINE_DROPPED, FINE_END, FINE_FIRST};
+    let bits = z.to_bits();
+    let fine = bits.clamp(FINE_FIRST, FINE_END) - FINE_FIRST;
+    let coarse = (bits.min(FINE_FIRST) >> COARSE_DROPPED) + (bits.saturating_sub(FINE_END) >> COARSE_DROPPED);
+    coarse + (fine >> FINE_DROPPED)
+}
+
 /// Records the projection of all splats to `frame.projected`, with the
 /// first (sh_degree + 1)² SH coefficients, and of their depth keys for `sort`. Writes their number to `splat_count` and clears the
 /// counters of `sort` and of the tile lists.
@@ -220,5 +230,51 @@ pub fn features_reference(features: &[f64], dim: usize, mode: FeatureMode) -> Ve
                 f.iter().map(move |x| x / (length + f64::from(epsilon)))
             })
             .collect(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::{Options, TestDevice, native, options, test_device};
+    use crate::math::Random;
+    use crate::pass::{RasterOptions, Rasterizer};
+    use crate::scene::seeded;
+    use glam::Vec3;
+
+    #[test]
+    fn depth_keys_grow_with_depth() {
+        let keys = |first: f32, ratio: f32| {
+            let depths = std::iter::successors(Some(first), move |z| Some(z * ratio));
+            depths.take_while(|z| *z < 3e38).map(depth_key)
+        };
+        // A step of the coarse octaves, and one of the fine ones.
+        assert!(keys(1e-37, 1.0 + 7e-5).is_sorted_by(|a, b| a < b));
+        assert!(keys(1.0 / 256.0, 1.0 + 2e-6).take(8_000_000).is_sorted_by(|a, b| a < b));
+        assert!(depth_key(f32::MAX) < shaders::project::HIDDEN_KEY);
+    }
+
+    /// Depths of any scale, without a near plane, by shaders and by native code.
+    #[test]
+    fn splats_of_any_depth_are_in_order() {
+        let natives = TestDevice::open(&Options { natives: native::ALL, ..options(None) }).unwrap();
+        let mut random = Random::new(3);
+        let (mut splats, camera) = seeded::small(300, 40, 30, 0, 3);
+        for mean in &mut splats.means {
+            let z = random.between(-12.0, 18.0).exp2() * random.between(1e-4, 1.0);
+            *mean = camera.pose.inverse().transform(DVec3::Z * z).as_vec3().to_array();
+        }
+        for device in [&test_device(), &natives] {
+            let params = SplatBuffers::upload(device, &splats, &[], 0).unwrap();
+            let mut raster = Rasterizer::new(device, 300, 0, 40, 30).unwrap();
+            raster.set_view(&View::new(&camera, 0.0)).unwrap();
+            raster.forward(&params, &RasterOptions::default()).unwrap();
+            let mean = |splat: u32| Vec3::from(splats.means[splat as usize]).as_dvec3();
+            let z = |splat: u32| camera.pose.transform(mean(splat)).z;
+            let pairs = raster.frame().depth_pairs.read().unwrap();
+            let shown = pairs.chunks(2).filter(|pair| pair[0] < shaders::project::HIDDEN_KEY);
+            let depths: Vec<f64> = shown.map(|pair| z(pair[1])).collect();
+            assert!(depths.len() > 250 && depths.is_sorted_by(|a, b| *a <= b * (1.0 + 1e-4)), "{depths:?}");
+        }
     }
 }

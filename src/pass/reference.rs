@@ -39,9 +39,8 @@ pub fn forward_in_order(
         (0..params.len()).map(|i| project::reference(params, i, view, cutoffs.alpha_min)).collect();
     let rendered_features = project::features_reference(&params.features, params.feature_dim, mode);
     let mut order: Vec<u32> = (0..params.len() as u32).filter(|&i| projected[i as usize].is_some()).collect();
-    // f32 depth as in the sort keys on the GPU; the sort is stable, so equal keys keep index order.
-    let depth = |i: u32| projected[i as usize].as_ref().map_or(0.0, |p| p.depth) as f32;
-    order.sort_by(|&a, &b| depth(a).total_cmp(&depth(b)));
+    // The sort is stable: equal keys keep the order of the splats.
+    order.sort_by_key(|&i| projected[i as usize].as_ref().map(|p| project::depth_key(p.depth as f32)));
     let order = given.map_or(order, <[u32]>::to_vec);
     let scene = raster_forward::ReferenceScene {
         projected: &projected,

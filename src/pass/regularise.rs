@@ -4,31 +4,40 @@ use super::frame::FrameBuffers;
 use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Records the gradients by D = Σwz and A of `weight · Σ |D − A·d|/d` over pixels with reference
-/// depth d > 0. Overwrites both planes of gradients, with zeros without a reference. For a mean,
-/// `weight` is divided by the number of pixels.
-pub fn record_depth(rec: &mut Recorder, frame: &FrameBuffers, reference: Option<&Buffer<f32>>, weight: f64) {
+/// depth d > 0, and of `weight · Σ |A − a|` over pixels with a wanted alpha a ≥ 0. Overwrites both
+/// planes of gradients, with zeros without either. For a mean, `weight` is divided by the number of
+/// pixels.
+pub fn record_depth_and_alpha(
+    rec: &mut Recorder,
+    frame: &FrameBuffers,
+    depth: Option<(&Buffer<f32>, f64)>,
+    alpha: Option<(&Buffer<f32>, f64)>,
+) {
     rec.pass("regularisers");
     let pixels = frame.pixels();
-    let alpha_plane = 4 + frame.feature_dim as u32;
-    let call = match reference {
-        Some(reference) => shaders::depth_l1::call(
-            &shaders::depth_l1::Bindings {
-                reference,
-                planes: &frame.planes,
-                transmittance: &frame.transmittance,
-                upstream: &frame.planes_grad,
-            },
-            &shaders::depth_l1::Push { pixels, alpha_plane, weight: weight as f32 },
-        ),
-        None => shaders::clear_depth_gradient::call(
-            &shaders::clear_depth_gradient::Bindings { upstream: &frame.planes_grad },
-            &shaders::clear_depth_gradient::Push { pixels, alpha_plane },
-        ),
-    };
+    // The variant without a term does not read its buffer: any other one takes the place.
+    let off = (&frame.planes, 0.0);
+    let ((reference, depth_weight), (wanted, alpha_weight)) = (depth.unwrap_or(off), alpha.unwrap_or(off));
+    let call = shaders::depth_and_alpha::call(
+        shaders::depth_and_alpha::Variant { depth: depth.is_some().into(), alpha: alpha.is_some().into() },
+        &shaders::depth_and_alpha::Bindings {
+            reference,
+            planes: &frame.planes,
+            wanted,
+            transmittance: &frame.transmittance,
+            upstream: &frame.planes_grad,
+        },
+        &shaders::depth_and_alpha::Push {
+            pixels,
+            alpha_plane: 4 + frame.feature_dim as u32,
+            depth_weight: depth_weight as f32,
+            alpha_weight: alpha_weight as f32,
+        },
+    );
     rec.dispatch_threads(call, [pixels, 1, 1]);
 }
 
-/// CPU reference of [`record_depth`]: (loss, gradients by D and by A).
+/// CPU reference of the depth term of [`record_depth_and_alpha`]: (loss, gradients by D and by A).
 pub fn depth_l1(depth: &[f64], alpha: &[f64], reference: &[f64], weight: f64) -> (f64, Vec<[f64; 2]>) {
     let mut loss = 0.0;
     let gradient = (0..depth.len()).map(|i| {
@@ -44,24 +53,7 @@ pub fn depth_l1(depth: &[f64], alpha: &[f64], reference: &[f64], weight: f64) ->
     (loss, gradient)
 }
 
-/// Records the gradient by A of `weight · Σ |A − a|` over pixels with a wanted alpha a ≥ 0, added
-/// to that of [`record_depth`].
-pub fn record_alpha(rec: &mut Recorder, frame: &FrameBuffers, wanted: &Buffer<f32>, weight: f64) {
-    rec.pass("regularisers");
-    let pixels = frame.pixels();
-    let alpha_plane = 4 + frame.feature_dim as u32;
-    let call = shaders::alpha_l1::call(
-        &shaders::alpha_l1::Bindings {
-            wanted,
-            transmittance: &frame.transmittance,
-            upstream: &frame.planes_grad,
-        },
-        &shaders::alpha_l1::Push { pixels, alpha_plane, weight: weight as f32 },
-    );
-    rec.dispatch_threads(call, [pixels, 1, 1]);
-}
-
-/// CPU reference of [`record_alpha`]: (loss, gradient by A).
+/// CPU reference of the alpha term of [`record_depth_and_alpha`]: (loss, gradient by A).
 pub fn alpha_l1(alpha: &[f64], wanted: &[f64], weight: f64) -> (f64, Vec<f64>) {
     let pairs = || alpha.iter().zip(wanted);
     let loss = pairs().filter(|(_, w)| **w >= 0.0).map(|(a, w)| weight * (a - w).abs()).sum();
@@ -182,7 +174,7 @@ mod tests {
         frame.transmittance.write(&narrow(&see_through)).unwrap();
         let buffer = device.buffer_from("reference", &narrow(&reference)).unwrap();
         let mut rec = Recorder::new(&device, "depth");
-        record_depth(&mut rec, frame, Some(&buffer), 0.25);
+        record_depth_and_alpha(&mut rec, frame, Some((&buffer, 0.25)), None);
         rec.run().unwrap();
         let upstream = frame.planes_grad.read().unwrap();
         let (_, gradient) = depth_l1(&depth, &alpha, &reference, 0.25);
@@ -197,7 +189,7 @@ mod tests {
             }
         }
         let mut rec = Recorder::new(&device, "clear");
-        record_depth(&mut rec, frame, None, 0.0);
+        record_depth_and_alpha(&mut rec, frame, None, None);
         rec.run().unwrap();
         assert!(frame.planes_grad.read().unwrap().iter().all(|&g| g == 0.0));
     }
@@ -218,9 +210,7 @@ mod tests {
         frame.transmittance.write(&narrow(&see_through)).unwrap();
         let buffer = device.buffer_from("wanted", &narrow(&wanted)).unwrap();
         let mut rec = Recorder::new(&device, "alpha");
-        record_depth(&mut rec, frame, None, 0.0);
-        record_alpha(&mut rec, frame, &buffer, 0.25);
-        record_alpha(&mut rec, frame, &buffer, 0.5);
+        record_depth_and_alpha(&mut rec, frame, None, Some((&buffer, 0.75)));
         rec.run().unwrap();
         let upstream = frame.planes_grad.read().unwrap();
         let (_, gradient) = alpha_l1(&alpha, &wanted, 0.75);

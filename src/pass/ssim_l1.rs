@@ -165,9 +165,9 @@ pub struct SsimL1 {
     moments: Buffer<f32>,
     slopes: Buffer<f32>,
     cross: Buffer<f32>,
-    ssim_sums: Buffer<f32>,
-    l1_sums: Buffer<f32>,
-    partials: Buffer<f32>,
+    /// Sums of SSIM, and from `first_l1` on those of |x − y|.
+    sums: Buffer<f32>,
+    first_l1: usize,
 }
 
 impl SsimL1 {
@@ -180,6 +180,7 @@ impl SsimL1 {
     pub fn with(device: &Device, bands: &[Bands], rows: SsimRowKernel) -> Result<Self> {
         let most = |count: fn(&Bands) -> usize| bands.iter().map(count).max().unwrap_or(0);
         let values = most(|b| CHANNELS * b.pixels());
+        let first_l1 = most(ssim_sums);
         let pairs = |name| device.buffer::<f32>(name, 2 * values);
         Ok(SsimL1 {
             rows,
@@ -187,17 +188,16 @@ impl SsimL1 {
             moments: pairs("ssim moments")?,
             slopes: pairs("ssim slopes")?,
             cross: device.buffer::<f32>("ssim cross slopes", values)?,
-            ssim_sums: device.buffer::<f32>("ssim sums", most(ssim_sums))?,
-            l1_sums: device.buffer::<f32>("l1 sums", most(l1_sums))?,
-            partials: device.buffer::<f32>("loss partials", sum::PARTIALS)?,
+            sums: device.buffer::<f32>("loss sums of strips", first_l1 + most(l1_sums))?,
+            first_l1,
         })
     }
 
     /// Records the pass for one of `bands`. `rendered` and `gradient` are planar `[≥3, rows, W]`,
     /// RGB first; `target` is `[3, rows, W]`. With `covered`, the sum of the pixel weights of the
     /// whole image, `target` is `[4, rows, W]`, the last plane the weights. Writes Σ|x−y| of the
-    /// band to `loss[slot]` and, unless its weight is 0, ΣSSIM to `loss[slot+1]`: see
-    /// [`ImageLoss::of`]. `weights` are those of L1 and 1 − SSIM.
+    /// band to slot `slot` of `loss` ([`sum`]) and, unless its weight is 0, ΣSSIM to the next one:
+    /// see [`ImageLoss::of`]. `weights` are those of L1 and 1 − SSIM.
     pub fn record(
         &self,
         rec: &mut Recorder,
@@ -237,7 +237,7 @@ impl SsimL1 {
                 slopes: &self.slopes,
                 cross: &self.cross,
                 gradient,
-                sums: &self.l1_sums,
+                sums: &self.sums,
             },
             &shaders::ssim_gradient::Push {
                 width,
@@ -247,21 +247,19 @@ impl SsimL1 {
                 first,
                 end,
                 weighted,
+                first_sum: self.first_l1 as i32,
             },
         );
         rec.dispatch(call, columns);
-        sum::record(rec, (&self.l1_sums, l1_sums(bands)), &self.partials, loss);
-        if with_ssim {
-            let sums = (&self.ssim_sums, ssim_sums(bands));
-            sum::record(rec, sums, &self.partials, (loss.0, loss.1 + 1));
-        }
+        let (l1, ssim) = (self.first_l1..self.first_l1 + l1_sums(bands), 0..ssim_sums(bands));
+        sum::record(rec, &self.sums, (l1, with_ssim.then_some(ssim)), loss);
     }
 
     fn record_rows(&self, rec: &mut Recorder, bands: &Bands, first: i32, end: i32) {
         let (width, height) = (bands.width as u32, bands.rows as u32);
         let strips = width.div_ceil(STRIP as u32);
         let (means, moments, slopes) = (&self.means, &self.moments, &self.slopes);
-        let (cross, sums) = (&self.cross, &self.ssim_sums);
+        let (cross, sums) = (&self.cross, &self.sums);
         let (w, h, n) = (width as i32, height as i32, strips as i32);
         match self.rows {
             SsimRowKernel::Strips => {
@@ -403,20 +401,18 @@ mod tests {
             let bands = Bands::whole(w, h);
             // Room for larger images, with the sums of one.
             let pass = SsimL1::with(&device, &[bands.clone(), Bands::whole(w + 30, h + 20)], rows).unwrap();
-            for sums in [&pass.l1_sums, &pass.ssim_sums] {
-                sums.write(&vec![1.0; (sums.bytes() / 4) as usize]).unwrap();
-            }
+            pass.sums.write(&vec![1.0; (pass.sums.bytes() / 4) as usize]).unwrap();
             let rendered = device.buffer_from("x", &x).unwrap();
             let stack = if weighted { [&y[..], &weights].concat() } else { y.clone() };
             let target = device.buffer_from("y", &stack).unwrap();
             let out = device.buffer::<f32>("gradient", 3 * w * h).unwrap();
-            let sums = device.buffer::<f32>("loss", 4).unwrap();
+            let sums = device.buffer::<f32>("loss", 3 * sum::PARTIALS).unwrap();
             let mut rec = Recorder::new(&device, "ssim");
             let band = (&bands, &bands.get(0));
             pass.record(&mut rec, band, &rendered, &target, &out, covered, [0.8, 0.2], (&sums, 1));
             rec.run().unwrap();
             let sums = sums.read().unwrap();
-            let loss = ImageLoss::of(&bands, [sums[1], sums[2]].map(f64::from), covered);
+            let loss = ImageLoss::of(&bands, [1, 2].map(|slot| sum::total(&sums, slot)), covered);
             // f32 sums of about 10⁴ values of order one: 1e-5.
             assert!(
                 (loss.l1 - expected.l1).abs() < 1e-5 && (loss.ssim - expected.ssim).abs() < 1e-5,

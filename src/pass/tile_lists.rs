@@ -98,7 +98,8 @@ impl TileLists {
         // Sums of the atomics need no entries.
         let indexed = grouping == TileBinning::Counting || summation == GradientReduction::Entries;
         let if_indexed = |count: usize| if indexed { count } else { 1 };
-        let entries = device.buffer::<u32>("entries", 2 * capacity)?;
+        let name = if indexed { "entries" } else { "tile_splats" };
+        let entries = device.buffer::<u32>(name, 2 * capacity)?;
         let group = match grouping {
             TileBinning::Counting => {
                 let lanes = counting_lanes(tiles, capacity + splats, device.info().max_storage_range);

@@ -8,6 +8,7 @@ use crate::gpu::{Buffer, Device, Program, Recorder};
 use crate::pass::metrics::planar;
 use crate::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
 use crate::pass::ssim_l1::{ImageLoss, SsimL1};
+use crate::pass::sum::{self, PARTIALS};
 use crate::pass::view::View;
 use crate::photo::PlainBorder as Border;
 use crate::pose::numeric::rotation_angle;
@@ -99,7 +100,7 @@ impl ViewRefiner {
             return Ok(camera.pose);
         }
         let loss = SsimL1::new(&self.device, std::slice::from_ref(&bands))?;
-        let sums = self.device.buffer::<f32>("loss sums", 4)?;
+        let sums = self.device.buffer::<f32>("loss sums", 2 * PARTIALS)?;
         raster.set_view(&View::new(camera, scale.near()))?;
         raster.forward(&self.params, &self.options)?;
         let target = self.device.buffer_from("photo", &planar(&target(photo, &raster)?))?;
@@ -125,8 +126,8 @@ impl ViewRefiner {
                 break;
             }
             let s = sums.read()?;
-            let total =
-                ImageLoss::of(&bands, [s[0], s[1]].map(f64::from), None).total(WEIGHTS[0], WEIGHTS[1]);
+            let total = ImageLoss::of(&bands, [0, 1].map(|slot| sum::total(&s, slot)), None)
+                .total(WEIGHTS[0], WEIGHTS[1]);
             if total < best.0 {
                 best = (total, pose);
             }

@@ -21,9 +21,8 @@ use std::sync::Arc;
 const SCRATCH: &[&str] = &[
     "entries",
     "entry splats",
-    "l1 sums",
     "large splats",
-    "loss partials",
+    "loss sums of strips",
     "scan sums",
     "sort histogram",
     "sort scratch",
@@ -32,8 +31,6 @@ const SCRATCH: &[&str] = &[
     "ssim means",
     "ssim moments",
     "ssim slopes",
-    "ssim sums",
-    "sum partials",
     "tile counters",
 ];
 

@@ -27,7 +27,6 @@ use crate::gpu::Native;
 /// All native passes.
 pub static ALL: &[Native] = &[
     Native { family: "adam", run: adam::run },
-    Native { family: "alpha_l1", run: small::alpha_l1 },
     Native { family: "bench_arithmetic", run: arithmetic::run },
     Native { family: "bin_base", run: bin::base },
     Native { family: "bin_count", run: bin::count },
@@ -36,10 +35,9 @@ pub static ALL: &[Native] = &[
     Native { family: "bin_scatter", run: bin::scatter },
     Native { family: "bin_sum", run: bin::sum },
     Native { family: "camera_sum", run: small::camera_sum },
-    Native { family: "clear_depth_gradient", run: small::clear_depth_gradient },
     Native { family: "count_pairs", run: raster::count_pairs },
     Native { family: "decode", run: decode::run },
-    Native { family: "depth_l1", run: small::depth_l1 },
+    Native { family: "depth_and_alpha", run: small::depth_and_alpha },
     Native { family: "features_forward", run: small::features_forward },
     Native { family: "label_weights", run: label_weights::run },
     Native { family: "project", run: project::run },
@@ -55,6 +53,7 @@ pub static ALL: &[Native] = &[
     Native { family: "sort_scatter", run: sort::scatter },
     Native { family: "ssim_columns", run: ssim::columns },
     Native { family: "ssim_rows", run: ssim::rows },
+    Native { family: "ssim_rows_shared", run: ssim::rows },
     Native { family: "ssim_gradient", run: ssim::gradient },
     Native { family: "sum", run: small::sum },
 ];

@@ -1,7 +1,7 @@
 //! `project.comp`.
 use super::splat::{Camera, Geometry};
 use crate::gpu::NativeCall;
-use crate::gpu::shaders::project::{DEPTH_BITS, DROPPED_BITS};
+use crate::gpu::shaders::project::{COARSE_DROPPED, FINE_DROPPED, FINE_END, FINE_FIRST, HIDDEN_KEY};
 use crate::gpu::shaders::shared::cutoffs::LOG2_ALPHA_MIN;
 use crate::gpu::shaders::shared::layout::PROJECTED_FLOATS;
 use crate::gpu::shaders::structs::CameraView;
@@ -12,11 +12,11 @@ use std::f32::consts::LOG2_E;
 
 const FLOATS: usize = PROJECTED_FLOATS as usize;
 
-/// Key of splats that nothing shows, behind all others.
-const HIDDEN_KEY: u32 = (1 << DEPTH_BITS) - 1;
-
-fn depth_key(z: f32, near: f32) -> u32 {
-    ((z.to_bits() - near.to_bits()) >> DROPPED_BITS).min(HIDDEN_KEY - 1)
+fn depth_key(z: f32) -> u32 {
+    let bits = z.to_bits();
+    let (below, above) = (bits.min(FINE_FIRST), bits.max(FINE_END) - FINE_END);
+    let fine = bits.clamp(FINE_FIRST, FINE_END) - FINE_FIRST;
+    (below >> COARSE_DROPPED) + (fine >> FINE_DROPPED) + (above >> COARSE_DROPPED)
 }
 
 pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
@@ -63,7 +63,7 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
             colour.z,
             g.t.z,
         ];
-        *pair = [if visible { depth_key(g.t.z, camera.near) } else { HIDDEN_KEY }, i as u32];
+        *pair = [if visible { depth_key(g.t.z) } else { HIDDEN_KEY }, i as u32];
     });
     Ok(())
 }

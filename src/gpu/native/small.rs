@@ -1,11 +1,13 @@
-//! Passes of one loop: `sum.comp`, `camera_sum.comp`, `depth_l1.comp`, `alpha_l1.comp`,
-//! `clear_depth_gradient.comp`, `ratio_penalty.comp` and `features_forward.comp`.
+//! Passes of one loop: `sum.comp`, `camera_sum.comp`, `depth_and_alpha.comp`, `ratio_penalty.comp`
+//! and `features_forward.comp`.
 use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::layout::CAMERA_GRADIENTS;
 use rayon::prelude::*;
 
 /// Numbers of one task.
 const CHUNK: usize = 1 << 14;
+/// Partial sums of a range.
+const PARTIALS: usize = crate::gpu::shaders::sum::PARTIALS as usize;
 
 /// GLSL's `sign`, which is 0 for 0.
 pub(super) fn sign(v: f32) -> f32 {
@@ -13,16 +15,21 @@ pub(super) fn sign(v: f32) -> f32 {
 }
 
 pub(super) fn sum(call: &mut NativeCall) -> Result<(), String> {
-    let ([count, slot], groups) = (call.words()?.map(|word| word as usize), call.groups()[0] as usize);
+    let [first0, count0, first1, count1, slot] = call.words()?.map(|word| word as usize);
+    let ranges = call.groups()[1] as usize;
     let [values, result] = call.memory([0, 1])?;
-    let values: &[f32] = &values.of()[..count];
-    let share = count.div_ceil(groups.max(1)).max(1);
-    let sums = result.of::<f32>()[slot..slot + groups].par_iter_mut().enumerate();
-    sums.for_each(|(group, sum)| {
-        let own = &values[(group * share).min(count)..((group + 1) * share).min(count)];
-        // Partial sums keep the rounding of long sums small.
-        *sum = own.chunks(256).map(|part| part.iter().sum::<f32>()).sum();
-    });
+    let values: &[f32] = values.of();
+    let result = result.of::<f32>()[PARTIALS * slot..].chunks_exact_mut(PARTIALS);
+    for ((first, count), result) in [(first0, count0), (first1, count1)].into_iter().zip(result).take(ranges)
+    {
+        let values = &values[first..first + count];
+        let share = count.div_ceil(PARTIALS).max(1);
+        result.par_iter_mut().with_min_len(8).enumerate().for_each(|(part, sum)| {
+            let own = &values[(part * share).min(count)..((part + 1) * share).min(count)];
+            // Partial sums keep the rounding of long sums small.
+            *sum = own.chunks(256).map(|part| part.iter().sum::<f32>()).sum();
+        });
+    }
     Ok(())
 }
 
@@ -36,47 +43,35 @@ pub(super) fn camera_sum(call: &mut NativeCall) -> Result<(), String> {
     Ok(())
 }
 
-/// Planes of an upstream stack: of depth, and of alpha.
-fn depth_and_alpha(upstream: &mut [f32], pixels: usize, alpha_plane: usize) -> [&mut [f32]; 2] {
-    let (before, alpha) = upstream.split_at_mut(alpha_plane * pixels);
-    [&mut before[3 * pixels..4 * pixels], &mut alpha[..pixels]]
-}
-
-pub(super) fn depth_l1(call: &mut NativeCall) -> Result<(), String> {
-    let [pixels, alpha_plane, weight] = call.words()?;
-    let (pixels, alpha_plane, weight) = (pixels as usize, alpha_plane as usize, f32::from_bits(weight));
-    let [reference, planes, transmittance, upstream] = call.memory([0, 1, 2, 3])?;
+pub(super) fn depth_and_alpha(call: &mut NativeCall) -> Result<(), String> {
+    let [pixels, alpha_plane, depth_weight, alpha_weight] = call.words()?;
+    let (pixels, alpha_plane) = (pixels as usize, alpha_plane as usize);
+    let [depth_weight, alpha_weight] = [depth_weight, alpha_weight].map(f32::from_bits);
+    // A term that is off has no buffers.
+    let [reference, planes, wanted, transmittance, upstream] = call.optional([0, 1, 2, 3, 4]);
     let (reference, planes): (&[f32], &[f32]) = (reference.of(), planes.of());
-    let (depths, left): (&[f32], &[f32]) = (&planes[3 * pixels..4 * pixels], transmittance.of());
-    let [by_depth, by_alpha] = depth_and_alpha(upstream.of(), pixels, alpha_plane);
-    let out = by_depth.par_iter_mut().zip(by_alpha).with_min_len(CHUNK);
-    out.zip(reference).zip(depths.par_iter().zip(left)).for_each(|((out, d), (depth, left))| {
-        let slope = if *d > 0.0 { weight * sign(depth - (1.0 - left) * d) } else { 0.0 };
-        *out.0 = if *d > 0.0 { slope / d } else { 0.0 };
-        *out.1 = -slope;
-    });
-    Ok(())
-}
-
-pub(super) fn alpha_l1(call: &mut NativeCall) -> Result<(), String> {
-    let [pixels, alpha_plane, weight] = call.words()?;
-    let (pixels, alpha_plane, weight) = (pixels as usize, alpha_plane as usize, f32::from_bits(weight));
-    let [wanted, transmittance, upstream] = call.memory([0, 1, 2])?;
     let (wanted, left): (&[f32], &[f32]) = (wanted.of(), transmittance.of());
-    let [_, by_alpha] = depth_and_alpha(upstream.of(), pixels, alpha_plane);
-    let out = by_alpha.par_iter_mut().with_min_len(CHUNK);
-    out.zip(wanted).zip(left).for_each(|((out, a), left)| {
-        if *a >= 0.0 {
-            *out += weight * sign((1.0 - left) - a);
-        }
-    });
-    Ok(())
-}
-
-pub(super) fn clear_depth_gradient(call: &mut NativeCall) -> Result<(), String> {
-    let [pixels, alpha_plane] = call.words()?.map(|word| word as usize);
-    let [upstream] = call.memory([0])?;
-    depth_and_alpha(upstream.of(), pixels, alpha_plane).into_iter().for_each(|plane| plane.fill(0.0));
+    let (before, by_alpha) = upstream.of::<f32>().split_at_mut(alpha_plane * pixels);
+    let by_depth = before[3 * pixels..4 * pixels].par_chunks_mut(CHUNK);
+    by_depth.zip(by_alpha[..pixels].par_chunks_mut(CHUNK)).enumerate().for_each(
+        |(chunk, (by_depth, by_alpha))| {
+            let own = chunk * CHUNK..chunk * CHUNK + by_depth.len();
+            by_depth.fill(0.0);
+            by_alpha.fill(0.0);
+            if !reference.is_empty() {
+                let (depths, left) = (&planes[3 * pixels..][own.clone()], &left[own.clone()]);
+                for (k, d) in reference[own.clone()].iter().enumerate().filter(|(_, d)| **d > 0.0) {
+                    let slope = depth_weight * sign(depths[k] - (1.0 - left[k]) * d);
+                    (by_depth[k], by_alpha[k]) = (slope / d, -slope);
+                }
+            }
+            if !wanted.is_empty() {
+                for ((by_alpha, a), left) in by_alpha.iter_mut().zip(&wanted[own.clone()]).zip(&left[own]) {
+                    *by_alpha += if *a >= 0.0 { alpha_weight * sign((1.0 - left) - a) } else { 0.0 };
+                }
+            }
+        },
+    );
     Ok(())
 }
 

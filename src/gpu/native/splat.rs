@@ -12,7 +12,7 @@ pub(super) struct Camera {
     pub focal: Vec2,
     pub centre: Vec2,
     size: Vec2,
-    pub near: f32,
+    near: f32,
 }
 
 impl Camera {

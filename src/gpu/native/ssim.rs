@@ -1,4 +1,6 @@
-//! `ssim_columns.comp`, `ssim_rows.comp` and `ssim_gradient.comp`.
+//! `ssim_columns.comp`, `ssim_rows.comp` (or `ssim_rows_shared.comp`) and `ssim_gradient.comp`. Only these passes read their
+//! scratch buffers, which therefore hold a plane per quantity here instead of pairs: rows of a plane
+//! are vectors.
 use super::small::sign;
 use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::ssim::{C1, C2, HALF, STRIP, WINDOW};
@@ -11,25 +13,34 @@ const TAPS: usize = WINDOW.len();
 const LANES: usize = 8;
 /// Rows that the outputs of a strip read.
 const READ: usize = ROWS + 2 * REACH;
+/// Columns that are blurred together: with four planes they fit the first-level cache.
+const BLOCK: usize = 64;
+
+/// Rows of a plane that a strip reads, in a block of columns.
+type Rows = [[f32; BLOCK]; READ];
 
 /// The weighted sum of eleven vectors.
 #[inline(always)]
-fn blur<S: Simd>(simd: S, mut tap: impl FnMut(usize) -> f32x8<S>) -> f32x8<S> {
-    let mut sum = f32x8::simd_from(simd, 0.0);
-    for (k, w) in WINDOW.iter().enumerate() {
-        sum = tap(k).mul_add(f32x8::simd_from(simd, *w as f32), sum);
+fn blur<S: Simd>(simd: S, tap: impl Fn(usize) -> f32x8<S>) -> f32x8<S> {
+    let weight = |k: usize| f32x8::simd_from(simd, WINDOW[k] as f32);
+    let mut sum = tap(REACH) * weight(REACH);
+    for k in 0..REACH {
+        sum = (tap(k) + tap(TAPS - 1 - k)).mul_add(weight(k), sum);
     }
     sum
 }
 
-/// Row `k` of a vertical blur of rows of `out.len()` numbers, a multiple of eight.
+/// Row `k` of the vertical blurs of some planes.
 #[inline(always)]
-fn blur_columns<S: Simd>(simd: S, rows: &[f32], k: usize, out: &mut [f32]) {
-    let stride = out.len();
-    for (block, out) in out.chunks_exact_mut(LANES).enumerate() {
-        let at = k * stride + block * LANES;
-        blur(simd, |tap| f32x8::from_slice(simd, &rows[at + tap * stride..][..LANES])).store_slice(out);
+fn blur_columns<S: Simd, const N: usize>(simd: S, rows: &[Rows; N], k: usize) -> [[f32; BLOCK]; N] {
+    let mut out = [[0.0; BLOCK]; N];
+    for (rows, out) in rows.iter().zip(&mut out) {
+        for (block, out) in out.chunks_exact_mut(LANES).enumerate() {
+            let at = block * LANES;
+            blur(simd, |tap| f32x8::from_slice(simd, &rows[k + tap][at..at + LANES])).store_slice(out);
+        }
     }
+    out
 }
 
 /// Horizontal blur of a row that begins [`REACH`] before the first output.
@@ -41,84 +52,128 @@ fn blur_row<S: Simd>(simd: S, row: &[f32], out: &mut [f32]) {
     }
 }
 
-/// Numbers of a row in whole vectors.
-fn padded(width: usize) -> usize {
-    width.next_multiple_of(LANES)
+/// The strips of an image, and their blocks of columns.
+struct Strips {
+    width: usize,
+    height: usize,
 }
 
-/// The rows that a strip reads, and the row of its scratch memory that each goes to; rows outside
-/// of the image are not among them.
-fn rows_read(strip: usize, height: usize) -> impl Iterator<Item = (usize, usize)> {
-    let row = move |i: usize| Some((i, (strip * ROWS + i).checked_sub(REACH).filter(|y| *y < height)?));
-    (0..READ).filter_map(row)
+impl Strips {
+    /// Places of the rows that a strip reads in a block of columns that begins at `x`; `None` for
+    /// those outside of the image.
+    fn rows(&self, strip: usize, x: usize) -> impl Iterator<Item = Option<std::ops::Range<usize>>> {
+        let (width, height) = (self.width, self.height);
+        (0..READ).map(move |i| {
+            let y = (strip * ROWS + i).checked_sub(REACH).filter(|y| *y < height)?;
+            Some(y * width + x..y * width + (x + BLOCK).min(width))
+        })
+    }
+
+    fn blocks(&self) -> impl Iterator<Item = usize> + use<> {
+        (0..self.width).step_by(BLOCK)
+    }
 }
 
-/// Vertical blurs of (x, y) and (x² + y², xy).
+/// Planes of `count` numbers at the start of a buffer.
+fn planes<const N: usize>(numbers: &mut [f32], count: usize) -> [&mut [f32]; N] {
+    let mut planes = numbers.chunks_exact_mut(count);
+    std::array::from_fn(|_| planes.next().unwrap_or_default())
+}
+
+/// Two images of one channel, and the weights of their pixels.
+#[derive(Clone, Copy)]
+struct Images<'a> {
+    x: &'a [f32],
+    y: &'a [f32],
+    weights: Option<&'a [f32]>,
+}
+
+impl<'a> Images<'a> {
+    fn of(
+        rendered: &'a [f32],
+        target: &'a [f32],
+        plane: usize,
+        channel: usize,
+        weighted: bool,
+    ) -> Images<'a> {
+        let own = channel * plane..(channel + 1) * plane;
+        let weights = weighted.then(|| &target[3 * plane..4 * plane]);
+        Images { x: &rendered[own.clone()], y: &target[own], weights }
+    }
+
+    /// Values of the pixels of `at` in both; a pixel of weight 0 has that of the target.
+    #[inline(always)]
+    fn values(&self, at: std::ops::Range<usize>, x: &mut [f32], y: &mut [f32]) {
+        x.copy_from_slice(&self.x[at.clone()]);
+        y.copy_from_slice(&self.y[at.clone()]);
+        if let Some(weights) = self.weights {
+            x.iter_mut().zip(&*y).zip(&weights[at]).for_each(|((x, y), w)| *x = w * (*x - y) + y);
+        }
+    }
+}
+
+/// Vertical blurs of x, y, x² + y² and xy.
 pub(super) fn columns(call: &mut NativeCall) -> Result<(), String> {
     let [width, height, weighted] = call.words()?.map(|word| word as usize);
     let [rendered, target, means, moments] = call.memory([0, 1, 2, 3])?;
     let (rendered, target): (&[f32], &[f32]) = (rendered.of(), target.of());
-    let plane = width * height;
-    let weights = (weighted != 0).then(|| &target[3 * plane..4 * plane]);
-    let means = means.of::<[f32; 2]>()[..3 * plane].par_chunks_mut(plane);
-    let moments = moments.of::<[f32; 2]>()[..3 * plane].par_chunks_mut(plane);
-    let (stride, level) = (padded(width), Level::new());
-    means.zip(moments).enumerate().for_each(|(channel, (means, moments))| {
-        let (x, y) = (&rendered[channel * plane..], &target[channel * plane..]);
-        let strips = means.par_chunks_mut(ROWS * width).zip(moments.par_chunks_mut(ROWS * width));
-        strips.enumerate().for_each(|(strip, (means, moments))| {
-            let mut rows: [Vec<f32>; 4] = std::array::from_fn(|_| vec![0.0; READ * stride]);
-            let mut out: [Vec<f32>; 4] = std::array::from_fn(|_| vec![0.0; stride]);
-            for (i, row) in rows_read(strip, height) {
-                let (own, at) = (i * stride..i * stride + width, row * width..(row + 1) * width);
-                let [u, v, squares, products] = rows.each_mut().map(|row| &mut row[own.clone()]);
-                u.copy_from_slice(&x[at.clone()]);
-                v.copy_from_slice(&y[at.clone()]);
-                if let Some(weights) = weights {
-                    u.iter_mut().zip(&*v).zip(&weights[at]).for_each(|((u, v), w)| *u = w * (*u - v) + v);
-                }
-                for k in 0..width {
-                    squares[k] = u[k] * u[k] + v[k] * v[k];
-                    products[k] = u[k] * v[k];
-                }
-            }
-            let strip = means.chunks_exact_mut(width).zip(moments.chunks_exact_mut(width));
-            for (k, (means, moments)) in strip.enumerate() {
-                dispatch!(level, simd => {
-                    for (rows, out) in rows.iter().zip(&mut out) {
-                        blur_columns(simd, rows, k, out);
-                    }
-                });
-                let [u, v, squares, products] = &out;
-                for x in 0..width {
-                    means[x] = [u[x], v[x]];
-                    moments[x] = [squares[x], products[x]];
-                }
-            }
+    let (plane, level) = (width * height, Level::new());
+    let [x, y] = planes(means.of(), 3 * plane);
+    let [squares, products] = planes(moments.of(), 3 * plane);
+    let channels = x.par_chunks_mut(plane).zip(y.par_chunks_mut(plane));
+    let channels = channels.zip(squares.par_chunks_mut(plane)).zip(products.par_chunks_mut(plane));
+    channels.enumerate().for_each(|(channel, (((x, y), squares), products))| {
+        let images = Images::of(rendered, target, plane, channel, weighted != 0);
+        let strips = x.par_chunks_mut(ROWS * width).zip(y.par_chunks_mut(ROWS * width));
+        let strips = strips.zip(squares.par_chunks_mut(ROWS * width));
+        let strips = strips.zip(products.par_chunks_mut(ROWS * width));
+        strips.enumerate().for_each(|(strip, (((x, y), squares), products))| {
+            let image = Strips { width, height };
+            dispatch!(level, simd => strip_columns(simd, &image, strip, &images, [x, y, squares, products]));
         });
     });
     Ok(())
 }
 
-/// SSIM and its derivatives by (E[x], E[x²], E[xy]) from blurred (x, y) and (x² + y², xy): planes
-/// of `blurred` to those of `out`.
 #[inline(always)]
-fn ssim_of(blurred: &[Vec<f32>; 4], out: &mut [Vec<f32>; 4]) {
-    let [x, y, squares, products] = blurred;
-    let [by_mean, by_square, by_product, ssim] = out;
-    let (c1, c2) = (C1 as f32, C2 as f32);
-    for k in 0..ssim.len() {
-        let product = x[k] * y[k];
-        let sum = x[k] * x[k] + y[k] * y[k];
-        let (a1, a2) = (2.0 * product + c1, 2.0 * (products[k] - product) + c2);
-        let (b1, b2) = (sum + c1, (squares[k] - sum) + c2);
-        let inverse = 1.0 / (b1 * b2);
-        let s = a1 * a2 * inverse;
-        by_mean[k] = 2.0 * y[k] * (a2 - a1) * inverse - 2.0 * x[k] * s / b1 + 2.0 * x[k] * s / b2;
-        by_square[k] = -s / b2;
-        by_product[k] = 2.0 * a1 * inverse;
-        ssim[k] = s;
+fn strip_columns<S: Simd>(simd: S, image: &Strips, strip: usize, images: &Images, mut out: [&mut [f32]; 4]) {
+    let mut rows = [[[0.0; BLOCK]; READ]; 4];
+    for first in image.blocks() {
+        let columns = BLOCK.min(image.width - first);
+        for (i, at) in image.rows(strip, first).enumerate() {
+            let [x, y, squares, products] = rows.each_mut().map(|rows| &mut rows[i]);
+            [&mut *x, &mut *y].into_iter().for_each(|row| row.fill(0.0));
+            if let Some(at) = at {
+                images.values(at, &mut x[..columns], &mut y[..columns]);
+            }
+            for k in (0..BLOCK).step_by(LANES) {
+                let [u, v] = [&*x, &*y].map(|row| f32x8::from_slice(simd, &row[k..k + LANES]));
+                u.mul_add(u, v * v).store_slice(&mut squares[k..k + LANES]);
+                (u * v).store_slice(&mut products[k..k + LANES]);
+            }
+        }
+        for k in 0..out[0].len() / image.width {
+            let blurred = blur_columns(simd, &rows, k);
+            let at = k * image.width + first;
+            for (out, blurred) in out.iter_mut().zip(&blurred) {
+                out[at..at + columns].copy_from_slice(&blurred[..columns]);
+            }
+        }
     }
+}
+
+/// SSIM and its derivatives by (E[x], E[x²], E[xy]), from blurred x, y, x² + y² and xy.
+#[inline(always)]
+fn ssim_of<S: Simd>([x, y, squares, products]: [f32x8<S>; 4]) -> [f32x8<S>; 4] {
+    let product = x * y;
+    let sum = x.mul_add(x, y * y);
+    let (a1, a2) = (product * 2.0 + C1 as f32, (products - product) * 2.0 + C2 as f32);
+    let (b1, b2) = (sum + C1 as f32, (squares - sum) + C2 as f32);
+    let inverse = f32x8::simd_from(x.token(), 1.0) / (b1 * b2);
+    let s = a1 * a2 * inverse;
+    // 1/b2 − 1/b1 = (b1 − b2) / (b1 b2).
+    let by_mean = (y * (a2 - a1) + x * s * (b1 - b2)) * (inverse * 2.0);
+    [by_mean, -(s * b1 * inverse), a1 * inverse * 2.0, s]
 }
 
 /// Memory of one row of [`rows`].
@@ -126,25 +181,31 @@ struct RowScratch {
     /// The four inputs, then the three derivatives, with a margin of zeros.
     wide: [Vec<f32>; 4],
     blurred: [Vec<f32>; 4],
-    derivatives: [Vec<f32>; 4],
 }
 
 impl RowScratch {
     fn new(width: usize) -> RowScratch {
-        let stride = padded(width);
+        let stride = width.next_multiple_of(LANES);
         let planes = |length: usize| std::array::from_fn(|_| vec![0.0; length]);
-        RowScratch { wide: planes(stride + TAPS - 1), blurred: planes(stride), derivatives: planes(stride) }
+        RowScratch { wide: planes(stride + TAPS - 1), blurred: planes(stride) }
     }
 
+    /// Leaves the blurred derivatives in the first three planes of `blurred`, and SSIM in `wide[3]`.
     #[inline(always)]
     fn compute<S: Simd>(&mut self, simd: S, width: usize) {
         for (wide, blurred) in self.wide.iter().zip(&mut self.blurred) {
             blur_row(simd, wide, blurred);
         }
-        ssim_of(&self.blurred, &mut self.derivatives);
-        for k in 0..3 {
-            self.wide[k][REACH..REACH + width].copy_from_slice(&self.derivatives[k][..width]);
-            blur_row(simd, &self.wide[k], &mut self.blurred[k]);
+        for at in (0..width).step_by(LANES) {
+            let blurred = self.blurred.each_ref().map(|row| f32x8::from_slice(simd, &row[at..at + LANES]));
+            for (wide, value) in self.wide.iter_mut().zip(ssim_of(blurred)) {
+                value.store_slice(&mut wide[REACH + at..REACH + at + LANES]);
+            }
+        }
+        for (wide, blurred) in self.wide.iter_mut().zip(&mut self.blurred).take(3) {
+            // Columns outside of the image have no SSIM.
+            wide[REACH + width..].fill(0.0);
+            blur_row(simd, wide, blurred);
         }
     }
 }
@@ -153,115 +214,136 @@ impl RowScratch {
 pub(super) fn rows(call: &mut NativeCall) -> Result<(), String> {
     let [width, height, strips, first, end] = call.words()?.map(|word| word as usize);
     let [means, moments, slopes, cross, sums] = call.memory([0, 1, 2, 3, 4])?;
-    let (means, moments): (&[[f32; 2]], &[[f32; 2]]) = (means.of(), moments.of());
-    let rows = 3 * height;
-    let slopes = slopes.of::<[f32; 2]>()[..rows * width].par_chunks_mut(width);
-    let cross = cross.of::<f32>()[..rows * width].par_chunks_mut(width);
+    let (rows, level) = (3 * height, Level::new());
+    let count = rows * width;
+    let (means, moments): (&[f32], &[f32]) = (means.of(), moments.of());
+    let blurred = [&means[..count], &means[count..], &moments[..count], &moments[count..]];
+    let [by_mean, by_square] = planes(slopes.of(), count);
+    let by_product = cross.of::<f32>()[..count].par_chunks_mut(width);
+    let out = by_mean.par_chunks_mut(width).zip(by_square.par_chunks_mut(width)).zip(by_product);
     let sums = sums.of::<f32>()[..rows * strips].par_chunks_mut(strips);
-    let level = Level::new();
-    slopes.zip(cross).zip(sums).enumerate().for_each_init(
+    out.zip(sums).enumerate().for_each_init(
         || RowScratch::new(width),
-        |scratch, (row, ((slopes, cross), sums))| {
+        |scratch, (row, (((by_mean, by_square), by_product), sums))| {
             let at = row * width..(row + 1) * width;
-            for (k, (mean, moment)) in means[at.clone()].iter().zip(&moments[at]).enumerate() {
-                [scratch.wide[0][k + REACH], scratch.wide[1][k + REACH]] = *mean;
-                [scratch.wide[2][k + REACH], scratch.wide[3][k + REACH]] = *moment;
+            for (wide, plane) in scratch.wide.iter_mut().zip(blurred) {
+                wide[REACH..REACH + width].copy_from_slice(&plane[at.clone()]);
+                wide[REACH + width..].fill(0.0);
             }
             dispatch!(level, simd => scratch.compute(simd, width));
             let is_counted = (first..end).contains(&(row % height));
-            for (sum, own) in sums.iter_mut().zip(scratch.derivatives[3][..width].chunks(ROWS)) {
+            for (sum, own) in sums.iter_mut().zip(scratch.wide[3][REACH..REACH + width].chunks(ROWS)) {
                 *sum = if is_counted { own.iter().sum() } else { 0.0 };
             }
-            for x in 0..width {
-                slopes[x] = [scratch.blurred[0][x], scratch.blurred[1][x]];
-                cross[x] = scratch.blurred[2][x];
+            for (out, blurred) in [by_mean, by_square, by_product].into_iter().zip(&scratch.blurred) {
+                out.copy_from_slice(&blurred[..width]);
             }
         },
     );
     Ok(())
 }
 
-/// The loss of [`gradient`], and the images of one channel.
+/// The loss of [`gradient`], of one channel.
 struct Loss<'a> {
-    x: &'a [f32],
-    y: &'a [f32],
-    weights: Option<&'a [f32]>,
+    images: Images<'a>,
     l1_weight: f32,
     dssim_weight: f32,
+    /// Blurred derivatives by (E[x], E[x²], E[xy]); empty without SSIM.
+    derivatives: [&'a [f32]; 3],
+    /// Rows with a gradient.
+    rows: std::ops::Range<usize>,
 }
 
 impl Loss<'_> {
-    /// The gradient of pixels `at`, from the blurred derivatives; adds the absolute differences.
+    /// Gradient of a strip, and the sums of the absolute differences of its columns.
+    #[inline(always)]
+    fn strip<S: Simd>(&self, simd: S, image: &Strips, strip: usize, gradient: &mut [f32], sums: &mut [f32]) {
+        let with_ssim = !self.derivatives[0].is_empty();
+        let mut rows = [[[0.0; BLOCK]; READ]; 3];
+        let mut blurred = [[0.0; BLOCK]; 3];
+        sums.fill(0.0);
+        for first in image.blocks() {
+            let columns = BLOCK.min(image.width - first);
+            for (i, at) in image.rows(strip, first).enumerate().filter(|_| with_ssim) {
+                for (rows, plane) in rows.iter_mut().zip(self.derivatives) {
+                    match &at {
+                        Some(at) => rows[i][..columns].copy_from_slice(&plane[at.clone()]),
+                        None => rows[i].fill(0.0),
+                    }
+                }
+            }
+            for (k, gradient) in gradient.chunks_exact_mut(image.width).enumerate() {
+                let row = strip * ROWS + k;
+                let gradient = &mut gradient[first..first + columns];
+                if !self.rows.contains(&row) {
+                    gradient.fill(0.0);
+                    continue;
+                }
+                if with_ssim {
+                    blurred = blur_columns(simd, &rows, k);
+                }
+                let at = row * image.width + first..row * image.width + first + columns;
+                self.differentiate(at, &blurred, gradient, &mut sums[first..first + columns]);
+            }
+        }
+    }
+
+    /// The gradient of pixels `at`; adds the absolute differences.
     #[inline(always)]
     fn differentiate(
         &self,
         at: std::ops::Range<usize>,
-        blurred: &[Vec<f32>; 3],
+        [a, b, c]: &[[f32; BLOCK]; 3],
         gradient: &mut [f32],
         sums: &mut [f32],
     ) {
-        let (x, y) = (&self.x[at.clone()], &self.y[at.clone()]);
-        let weights = self.weights.map(|weights| &weights[at]);
-        let [a, b, c] = blurred.each_ref().map(|plane| &plane[..gradient.len()]);
-        for k in 0..gradient.len() {
-            let share = weights.map_or(1.0, |w| w[k]);
-            let v = y[k];
-            let u = if weights.is_some() { share * (x[k] - v) + v } else { x[k] };
-            let slope = self.l1_weight * sign(u - v);
-            gradient[k] = share * (slope - self.dssim_weight * (a[k] + 2.0 * u * b[k] + v * c[k]));
-            sums[k] += (u - v).abs();
+        let (mut x, mut y) = ([0.0; BLOCK], [0.0; BLOCK]);
+        let columns = gradient.len();
+        self.images.values(at.clone(), &mut x[..columns], &mut y[..columns]);
+        let mut out = [0.0; BLOCK];
+        for k in 0..BLOCK {
+            let slope = self.l1_weight * sign(x[k] - y[k]);
+            out[k] = slope - self.dssim_weight * (a[k] + 2.0 * x[k] * b[k] + y[k] * c[k]);
         }
+        if let Some(weights) = self.images.weights {
+            out.iter_mut().zip(&weights[at]).for_each(|(out, weight)| *out *= weight);
+        }
+        gradient.copy_from_slice(&out[..columns]);
+        sums.iter_mut().enumerate().for_each(|(k, sum)| *sum += (x[k] - y[k]).abs());
     }
 }
 
 /// Vertical blurs of the derivatives, the gradient, and the sums of absolute differences; without
 /// SSIM the last two alone.
 pub(super) fn gradient(call: &mut NativeCall) -> Result<(), String> {
-    let words: [u32; 7] = call.words()?;
+    let words: [u32; 8] = call.words()?;
     let [width, height] = [0, 1].map(|k| words[k] as usize);
     let [l1_weight, dssim_weight] = [2, 3].map(|k| f32::from_bits(words[k]));
-    let [first, end, weighted] = [4, 5, 6].map(|k| words[k] as usize);
-    let (plane, strips) = (width * height, height.div_ceil(ROWS));
+    let [first, end, weighted, first_sum] = [4, 5, 6, 7].map(|k| words[k] as usize);
+    let (plane, strips, level) = (width * height, height.div_ceil(ROWS), Level::new());
     let with_ssim = call.variant()[0] == 1;
     // Without SSIM there are no derivatives.
     let [rendered, target, slopes, cross, gradient, sums] = call.optional([0, 1, 2, 3, 4, 5]);
     let (rendered, target): (&[f32], &[f32]) = (rendered.of(), target.of());
-    let (slopes, cross): (&[[f32; 2]], &[f32]) = (slopes.of(), cross.of());
+    let (slopes, cross): (&[f32], &[f32]) = (slopes.of(), cross.of());
     let gradient = gradient.of::<f32>()[..3 * plane].par_chunks_mut(plane);
-    let sums = sums.of::<f32>()[..3 * strips * width].par_chunks_mut(strips * width);
-    let weights = (weighted != 0).then(|| &target[3 * plane..4 * plane]);
-    let (stride, level) = (padded(width), Level::new());
+    let sums = sums.of::<f32>()[first_sum..][..3 * strips * width].par_chunks_mut(strips * width);
     gradient.zip(sums).enumerate().for_each(|(channel, (gradient, sums))| {
-        let base = channel * plane;
-        let (x, y) = (&rendered[base..base + plane], &target[base..base + plane]);
-        let loss = Loss { x, y, weights, l1_weight, dssim_weight };
+        let own = channel * plane..(channel + 1) * plane;
+        let loss = Loss {
+            images: Images::of(rendered, target, plane, channel, weighted != 0),
+            l1_weight,
+            dssim_weight,
+            derivatives: match with_ssim {
+                true => [&slopes[own.clone()], &slopes[3 * plane..][own.clone()], &cross[own]],
+                false => [&[]; 3],
+            },
+            rows: first..end,
+        };
         let strips = gradient.par_chunks_mut(ROWS * width).zip(sums.par_chunks_mut(width));
         strips.enumerate().for_each(|(strip, (gradient, sums))| {
-            let length = if with_ssim { READ * stride } else { 0 };
-            let mut rows: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; length]);
-            let mut blurred: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; stride]);
-            for (i, row) in rows_read(strip, height).filter(|_| with_ssim) {
-                let at = base + row * width..base + (row + 1) * width;
-                for (k, (slope, cross)) in slopes[at.clone()].iter().zip(&cross[at]).enumerate() {
-                    rows[0][i * stride + k] = slope[0];
-                    rows[1][i * stride + k] = slope[1];
-                    rows[2][i * stride + k] = *cross;
-                }
-            }
-            sums.fill(0.0);
-            for (k, gradient) in gradient.chunks_exact_mut(width).enumerate() {
-                let row = strip * ROWS + k;
-                if !(first..end).contains(&row) {
-                    gradient.fill(0.0);
-                    continue;
-                }
-                dispatch!(level, simd => {
-                    for (rows, blurred) in rows.iter().zip(&mut blurred).filter(|_| with_ssim) {
-                        blur_columns(simd, rows, k, blurred);
-                    }
-                    loss.differentiate(row * width..(row + 1) * width, &blurred, gradient, sums);
-                });
-            }
+            let image = Strips { width, height };
+            dispatch!(level, simd => loss.strip(simd, &image, strip, gradient, sums));
         });
     });
     Ok(())

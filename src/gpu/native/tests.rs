@@ -8,6 +8,7 @@ use crate::math::Random;
 use crate::pass::adam::{Class, Moments, Schedule};
 use crate::pass::bands::{Band, Bands};
 use crate::pass::ssim_l1::{SsimL1, SsimRowKernel};
+use crate::pass::sum::{self, PARTIALS};
 use crate::pass::view::View;
 use crate::pass::{RasterOptions, Rasterizer, SplatBuffers, pairs};
 use crate::scene::{DepthMap, Image, RgbImage, Splats, seeded};
@@ -83,13 +84,15 @@ fn ssim_and_l1_match_shaders() {
                 let pass = SsimL1::with(device, std::slice::from_ref(&bands), SsimRowKernel::Strips).unwrap();
                 let (x, y) = (device.buffer_from("x", &x).unwrap(), device.buffer_from("y", &y).unwrap());
                 let gradient = device.buffer::<f32>("gradient", 3 * pixels).unwrap();
-                let sums = device.buffer::<f32>("sums", 4).unwrap();
+                let sums = device.buffer::<f32>("sums", 3 * PARTIALS).unwrap();
                 let mut rec = Recorder::new(device, "loss");
                 // Rows at the edges belong to other bands.
                 let band = (&bands, &Band { inner: 2..height - 1, ..bands.get(0) });
                 pass.record(&mut rec, band, &x, &y, &gradient, covered, weights, (&sums, 1));
                 rec.run().unwrap();
-                (gradient.read().unwrap(), sums.read().unwrap())
+                let sums = sums.read().unwrap();
+                let sums = [1, 2].map(|slot| sum::total(&sums, slot) as f32);
+                (gradient.read().unwrap(), sums.to_vec())
             };
             let [shader, native] = devices().map(|device| run(&device));
             let (row, last) = (3 * width, 3 * pixels);
