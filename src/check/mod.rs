@@ -1,9 +1,13 @@
 //! Compares every pass on a device with its CPU reference, in seconds: `splatvk doctor --check`.
-//! Variants that gave wrong results are disabled for this device and driver ([`KernelVariant`]).
+//! Variants that gave wrong results are disabled for this device and driver ([`KernelVariant`]), and
+//! the faster of two correct ones is preferred ([`choose`]).
+pub mod choose;
 mod compared;
 mod data;
+mod first_use;
 mod images;
 mod render;
+mod timing;
 
 use crate::Result;
 use crate::gpu::{Device, KernelVariant, Options};
@@ -11,6 +15,9 @@ use crate::pass::GradientReduction;
 use compared::Found;
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
+
+pub use first_use::open;
+pub use timing::{SceneSize, time_variants};
 
 /// One comparison.
 #[derive(Clone, Debug)]
@@ -72,9 +79,18 @@ pub fn run(
     options: &Options,
     report: &mut dyn FnMut(&Row) -> Result<()>,
 ) -> Result<Vec<Row>> {
-    let mut device = device.clone();
+    compare(device.clone(), options, &|_| true, report)
+}
+
+/// [`run`] for some of the cases.
+fn compare(
+    mut device: Device,
+    options: &Options,
+    compares: &dyn Fn(&Case) -> bool,
+    report: &mut dyn FnMut(&Row) -> Result<()>,
+) -> Result<Vec<Row>> {
     let mut rows: Vec<Row> = Vec::new();
-    for case in cases(device.info().float_atomics) {
+    for case in cases(device.info().float_atomics).filter(compares) {
         rows.push(case.row(&device));
         report(&rows[rows.len() - 1])?;
         let disabled = names(&wrong_variants(&rows));
@@ -95,10 +111,14 @@ pub fn names(variants: &BTreeSet<KernelVariant>) -> BTreeSet<String> {
     variants.iter().map(|v| v.name().to_owned()).collect()
 }
 
+/// Variants with wrong results.
+pub fn wrong(rows: &[Row]) -> BTreeSet<KernelVariant> {
+    rows.iter().filter(|r| r.outcome.is_err()).filter_map(|r| r.variant).collect()
+}
+
 /// Variants to disable: those with wrong results and a correct replacement.
 pub fn wrong_variants(rows: &[Row]) -> BTreeSet<KernelVariant> {
-    let wrong: BTreeSet<KernelVariant> =
-        rows.iter().filter(|r| r.outcome.is_err()).filter_map(|r| r.variant).collect();
+    let wrong = wrong(rows);
     let has_replacement = |variant: &KernelVariant| {
         let other = variant.replacement();
         !wrong.contains(&other) || !wrong.contains(&other.replacement())

@@ -24,6 +24,15 @@ pub fn open_with(options: &Options) -> crate::Result<Device> {
     Ok(Device::open(&Options { natives, ..options.clone() })?)
 }
 
+/// Whether kernel variants may be timed at the first use of a device that is opened with these
+/// options. Without a cache every process would time them; with disabled variants, results and
+/// times are those of a test; a deterministic device uses no preferences. `SPLATVK_TUNE=0` turns it
+/// off.
+pub fn may_choose_kernels(options: &Options) -> bool {
+    let off = std::env::var("SPLATVK_TUNE").is_ok_and(|v| v == "0");
+    !off && options.cache.is_some() && options.disabled.is_empty() && !options.deterministic
+}
+
 fn check_disabled(options: &Options) -> crate::Result<()> {
     let known = KernelVariant::ALL.map(KernelVariant::name);
     match options.disabled.iter().find(|name| !known.contains(&name.as_str())) {

@@ -1,5 +1,7 @@
-//! Kernel variants that compute the same. One replaces another that gave wrong results on a device.
+//! Kernel variants that compute the same. One replaces another that gave wrong results on a device,
+//! or that was slower there.
 use splatvk_gpu::{DeviceInfo, NATIVE_FLOAT_ATOMICS};
+use std::collections::BTreeSet;
 
 /// One of two or more implementations of a pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -132,12 +134,6 @@ impl KernelVariant {
         }
     }
 
-    /// The faster of two variants that replace each other, by the kind of device, unless it is
-    /// disabled.
-    pub fn faster(info: &DeviceInfo, on_cpu: KernelVariant, on_gpu: KernelVariant) -> KernelVariant {
-        (if info.is_cpu { on_cpu } else { on_gpu }).or_replacement(info)
-    }
-
     /// This variant, or its replacement where it alone is disabled.
     pub fn or_replacement(self, info: &DeviceInfo) -> KernelVariant {
         let other = self.replacement();
@@ -146,13 +142,88 @@ impl KernelVariant {
     }
 }
 
+/// Two kernel variants that replace each other: the defaults by kind of device, and the replacement
+/// of a default.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct VariantPair {
+    /// Default on CPU devices.
+    pub on_cpu: KernelVariant,
+    /// Default on GPUs.
+    pub on_gpu: KernelVariant,
+}
+
+const fn pair(on_cpu: KernelVariant, on_gpu: KernelVariant) -> VariantPair {
+    VariantPair { on_cpu, on_gpu }
+}
+
+impl VariantPair {
+    /// Radix sorts.
+    pub const SORTS: VariantPair = pair(KernelVariant::ChunkSort, KernelVariant::SweepSort);
+    /// Binnings of the tile lists.
+    pub const LISTS: VariantPair = pair(KernelVariant::CountedLists, KernelVariant::SortedLists);
+    /// Reductions of gradients over the pixels of a tile.
+    pub const TILE_SUMS: VariantPair = pair(KernelVariant::ShuffledSums, KernelVariant::SharedSums);
+    /// Reductions of gradients over tiles. Atomics are the default everywhere.
+    pub const GRADIENTS: VariantPair = pair(KernelVariant::AtomicGradients, KernelVariant::AtomicGradients);
+    /// Kernels of the SH gradients.
+    pub const SH: VariantPair = pair(KernelVariant::ShPerThread, KernelVariant::ShShared);
+    /// Updates of the parameters.
+    pub const UPDATES: VariantPair = pair(KernelVariant::SeparateUpdate, KernelVariant::FusedUpdate);
+    /// Row kernels of SSIM.
+    pub const SSIM_ROWS: VariantPair = pair(KernelVariant::SsimStrips, KernelVariant::SsimShared);
+    /// Plane sweeps of stereo.
+    pub const SWEEPS: VariantPair = pair(KernelVariant::HostSweep, KernelVariant::DeviceSweep);
+    /// Searches for text queries.
+    pub const QUERIES: VariantPair = pair(KernelVariant::HostQuery, KernelVariant::DeviceQuery);
+
+    /// Pairs that are timed on a device, those first that later ones build on.
+    pub const TIMED: [VariantPair; 7] = [
+        VariantPair::SORTS,
+        VariantPair::LISTS,
+        VariantPair::TILE_SUMS,
+        VariantPair::GRADIENTS,
+        VariantPair::SH,
+        VariantPair::UPDATES,
+        VariantPair::SSIM_ROWS,
+    ];
+
+    /// The default on CPU devices or on GPUs, and its replacement.
+    pub fn variants(self, is_cpu: bool) -> [KernelVariant; 2] {
+        let default = if is_cpu { self.on_cpu } else { self.on_gpu };
+        [default, default.replacement()]
+    }
+
+    /// The default, or its replacement where that is among `preferred` names.
+    pub fn preferred(self, is_cpu: bool, preferred: &BTreeSet<String>) -> KernelVariant {
+        let [default, other] = self.variants(is_cpu);
+        if preferred.contains(other.name()) { other } else { default }
+    }
+
+    /// The variant to use on a device: the preferred one, unless it alone is disabled.
+    ///
+    /// A deterministic device keeps the defaults, so that its bits depend on no timing. So does one
+    /// on which native code replaces the shaders: only the defaults have native code, and
+    /// preferences are those of shaders.
+    pub fn chosen(self, info: &DeviceInfo) -> KernelVariant {
+        let nothing = BTreeSet::new();
+        let keeps_defaults = info.deterministic || replaces_shaders(info, &info.disabled);
+        let preferred = info.preferred.as_ref().filter(|_| !keeps_defaults).unwrap_or(&nothing);
+        self.preferred(info.is_cpu, preferred).or_replacement(info)
+    }
+}
+
+/// Whether native code replaces shaders on a device with these disabled variants.
+pub fn replaces_shaders(info: &DeviceInfo, disabled: &BTreeSet<String>) -> bool {
+    info.is_cpu && info.mapped && !disabled.contains(KernelVariant::NativePasses.name())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::gpu::{Options, TestDevice, options, test_device};
     use crate::pass::sort::SortAlgorithm;
     use crate::pass::ssim_l1::SsimRowKernel;
-    use crate::pass::{GradientReduction, ShGradientKernel, TileBinning, TileSums};
+    use crate::pass::{GradientReduction, ShGradientKernel, TileBinning, TileSums, UpdateKernel};
 
     #[test]
     fn disabled_variants_are_replaced() {
@@ -182,5 +253,53 @@ mod tests {
         assert_eq!(device.info().float_atomics, usual.info().float_atomics);
         let other = if usual.info().is_cpu { KernelVariant::ShPerThread } else { KernelVariant::ShShared };
         assert_ne!(ShGradientKernel::of(&without(&[other])), ShGradientKernel::of(&usual));
+    }
+
+    /// A device that runs shaders and prefers the variants that are no defaults on it.
+    fn preferring_others(disabled: &[KernelVariant], deterministic: bool) -> TestDevice {
+        let is_cpu = test_device().info().is_cpu;
+        let names = |variants: &[KernelVariant]| variants.iter().map(|v| v.name().to_owned()).collect();
+        let preferred: BTreeSet<String> = names(&VariantPair::TIMED.map(|pair| pair.variants(is_cpu)[1]));
+        let disabled = names(disabled);
+        let preferred = Some(preferred);
+        TestDevice::open(&Options { disabled, preferred, deterministic, ..options(None) }).unwrap()
+    }
+
+    #[test]
+    fn preferred_variants_replace_defaults() {
+        let usual = test_device();
+        let device = preferring_others(&[KernelVariant::NativePasses], false);
+        assert_ne!(SortAlgorithm::of(&device), SortAlgorithm::of(&usual));
+        assert_ne!(SsimRowKernel::of(&device), SsimRowKernel::of(&usual));
+        assert_ne!(TileSums::of(&device), TileSums::of(&usual));
+        assert_ne!(TileBinning::of(&device), TileBinning::of(&usual));
+        assert_ne!(ShGradientKernel::of(&device), ShGradientKernel::of(&usual));
+        assert_ne!(UpdateKernel::of(device.info()), UpdateKernel::of(usual.info()));
+        assert_eq!(GradientReduction::of(&device), GradientReduction::Entries);
+    }
+
+    #[test]
+    fn disabled_beats_preferred() {
+        let usual = test_device();
+        let [_, other] = VariantPair::SORTS.variants(usual.info().is_cpu);
+        let off = [KernelVariant::NativePasses, other, KernelVariant::StoredGradients];
+        let device = preferring_others(&off, false);
+        assert_eq!(SortAlgorithm::of(&device), SortAlgorithm::of(&usual));
+        assert_eq!(GradientReduction::of(&device), GradientReduction::Atomics);
+        assert_ne!(TileSums::of(&device), TileSums::of(&usual));
+    }
+
+    #[test]
+    fn deterministic_and_native_keep_defaults() {
+        let usual = test_device();
+        let defaults = |device: &TestDevice| {
+            for pair in VariantPair::TIMED {
+                assert_eq!(pair.chosen(device.info()), pair.variants(device.info().is_cpu)[0]);
+            }
+        };
+        defaults(&preferring_others(&[KernelVariant::NativePasses], true));
+        if replaces_shaders(usual.info(), &BTreeSet::new()) {
+            defaults(&preferring_others(&[], false));
+        }
     }
 }

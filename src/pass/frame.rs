@@ -4,7 +4,7 @@ use super::bands::Bands;
 use super::channels::{Block, blocks};
 use super::tile_lists::{TILE, TileLists};
 use crate::Result;
-use crate::gpu::{self, Buffer, Device, KernelVariant, shaders};
+use crate::gpu::{self, Buffer, Device, KernelVariant, VariantPair, shaders};
 use crate::sync::lock;
 use std::ops::Range;
 
@@ -122,7 +122,7 @@ pub enum TileSums {
 impl TileSums {
     /// The faster reduction for the device, unless it is disabled.
     pub fn of(device: &Device) -> TileSums {
-        match KernelVariant::faster(device.info(), KernelVariant::ShuffledSums, KernelVariant::SharedSums) {
+        match VariantPair::TILE_SUMS.chosen(device.info()) {
             KernelVariant::ShuffledSums => TileSums::Shuffles,
             _ => TileSums::Shared,
         }
@@ -147,7 +147,7 @@ impl GradientReduction {
     /// The faster reduction, unless it is disabled or the device was opened as deterministic.
     pub fn of(device: &Device) -> GradientReduction {
         let info = device.info();
-        match KernelVariant::AtomicGradients.or_replacement(info) {
+        match VariantPair::GRADIENTS.chosen(info) {
             KernelVariant::AtomicGradients if !info.deterministic => GradientReduction::Atomics,
             _ => GradientReduction::Entries,
         }

@@ -10,7 +10,7 @@ use super::project_backward::{groups, record_camera};
 use super::regularise::{RatioPenalty, ratio_penalty};
 use super::splat_buffers::SplatBuffers;
 use crate::gpu::shaders::structs::CameraView;
-use crate::gpu::{Buffer, DeviceInfo, KernelVariant, Recorder, shaders};
+use crate::gpu::{Buffer, DeviceInfo, KernelVariant, Recorder, VariantPair, shaders};
 use crate::scene::sh_coefficients;
 
 /// Rows of the [`Schedule`], and places in the array of moments, of the parameter classes: means,
@@ -39,7 +39,7 @@ pub enum UpdateKernel {
 impl UpdateKernel {
     /// The faster choice for the device, unless it is disabled or the device binds too few buffers.
     pub fn of(info: &DeviceInfo) -> UpdateKernel {
-        match KernelVariant::faster(info, KernelVariant::SeparateUpdate, KernelVariant::FusedUpdate) {
+        match VariantPair::UPDATES.chosen(info) {
             KernelVariant::FusedUpdate if fits(info) => UpdateKernel::Fused,
             _ => UpdateKernel::Separate,
         }

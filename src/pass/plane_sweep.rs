@@ -3,7 +3,7 @@
 use crate::Result;
 use crate::gpu::shaders::shared::plane_sweep::VIEW_SHARES;
 use crate::gpu::shaders::{plane_sweep, plane_sweep_refine, structs};
-use crate::gpu::{Buffer, Device, KernelVariant, Recorder};
+use crate::gpu::{Buffer, Device, KernelVariant, Recorder, VariantPair};
 use crate::pass::plane_sweep_cpu::CpuMatcher;
 use glam::Vec4;
 use splatvk_sfm::stereo::PLANE_BYTES;
@@ -35,8 +35,7 @@ impl PlaneSweep for DevicePlaneSweep {
         sources: &[SourceView],
         planes: &[Vec4],
     ) -> Result<Box<dyn Matcher>> {
-        let (host, device) = (KernelVariant::HostSweep, KernelVariant::DeviceSweep);
-        Ok(match KernelVariant::faster(self.0.info(), host, device) {
+        Ok(match VariantPair::SWEEPS.chosen(self.0.info()) {
             KernelVariant::HostSweep => {
                 Box::new(CpuMatcher::new(luma.to_vec(), sources.to_vec(), planes.to_vec()))
             }

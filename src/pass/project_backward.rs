@@ -13,7 +13,7 @@ use super::raster_backward::SplatGradient;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::structs::CameraView;
-use crate::gpu::{Buffer, Device, KernelVariant, Recorder, shaders};
+use crate::gpu::{Buffer, Device, KernelVariant, Recorder, VariantPair, shaders};
 use crate::scene::sh;
 use glam::{DMat3, DVec3, DVec4};
 
@@ -29,7 +29,7 @@ pub enum ShGradientKernel {
 impl ShGradientKernel {
     /// The faster kernel for the device, unless it is disabled.
     pub fn of(device: &Device) -> ShGradientKernel {
-        match KernelVariant::faster(device.info(), KernelVariant::ShPerThread, KernelVariant::ShShared) {
+        match VariantPair::SH.chosen(device.info()) {
             KernelVariant::ShPerThread => ShGradientKernel::PerThread,
             _ => ShGradientKernel::Shared,
         }

@@ -4,7 +4,7 @@ use crate::Result;
 use crate::gpu::shaders::query_columns::ROWS;
 use crate::gpu::shaders::query_peaks::{NONE, RUN, WORKGROUP};
 use crate::gpu::shaders::shared::query::{ANSWERS, SUMMED_LEVELS};
-use crate::gpu::{Buffer, Device, KernelVariant, Program, Recorder, shaders};
+use crate::gpu::{Buffer, Device, KernelVariant, Program, Recorder, VariantPair, shaders};
 use crate::query::frame::{FrameSearch, LevelPeaks, Table};
 use crate::query::maps::CodeMaps;
 use std::collections::BTreeMap;
@@ -42,8 +42,7 @@ impl DeviceSearch {
     /// Uploads the maps of frames with at most `codes` codes per level, if the device is to search
     /// them: `None` where the processor does, or for a frame that is too large.
     pub fn open(device: &Device, frames: &[Arc<CodeMaps>], codes: usize) -> Result<Option<DeviceSearch>> {
-        let (host, own) = (KernelVariant::HostQuery, KernelVariant::DeviceQuery);
-        match KernelVariant::faster(device.info(), host, own) {
+        match VariantPair::QUERIES.chosen(device.info()) {
             KernelVariant::DeviceQuery => DeviceSearch::new(device, frames, codes),
             _ => Ok(None),
         }

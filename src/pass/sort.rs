@@ -9,7 +9,7 @@
 //! decoupled look-back, and counts a predecessor itself where that makes no progress. Both are
 //! correct on any device and any subgroup size.
 use crate::Result;
-use crate::gpu::{Buffer, Device, KernelVariant, LOOP_ROUNDS, Recorder, shaders};
+use crate::gpu::{Buffer, Device, KernelVariant, LOOP_ROUNDS, Recorder, VariantPair, shaders};
 
 /// Algorithm of the radix sort.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -23,7 +23,7 @@ pub enum SortAlgorithm {
 impl SortAlgorithm {
     /// The faster algorithm for the device, unless it is disabled.
     pub fn of(device: &Device) -> SortAlgorithm {
-        match KernelVariant::faster(device.info(), KernelVariant::ChunkSort, KernelVariant::SweepSort) {
+        match VariantPair::SORTS.chosen(device.info()) {
             KernelVariant::ChunkSort => SortAlgorithm::Chunks,
             _ => SortAlgorithm::Sweep,
         }

@@ -10,7 +10,7 @@ use super::bands::{Band, Bands};
 use super::sum;
 use crate::Result;
 use crate::gpu::shaders::shared::ssim::{self as shared, C1, C2};
-use crate::gpu::{Buffer, Device, KernelVariant, Recorder, shaders};
+use crate::gpu::{Buffer, Device, KernelVariant, Recorder, VariantPair, shaders};
 use serde::{Deserialize, Serialize};
 
 /// Taps of the SSIM window.
@@ -151,7 +151,7 @@ pub enum SsimRowKernel {
 impl SsimRowKernel {
     /// The faster kernel for the device, unless it is disabled.
     pub fn of(device: &Device) -> SsimRowKernel {
-        match KernelVariant::faster(device.info(), KernelVariant::SsimStrips, KernelVariant::SsimShared) {
+        match VariantPair::SSIM_ROWS.chosen(device.info()) {
             KernelVariant::SsimStrips => SsimRowKernel::Strips,
             _ => SsimRowKernel::Shared,
         }

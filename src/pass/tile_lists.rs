@@ -3,7 +3,7 @@ use super::frame::GradientReduction;
 use super::scan::Scan;
 use super::sort::{Sort, SortAlgorithm};
 use crate::Result;
-use crate::gpu::{Buffer, Device, KernelVariant, LOOP_ROUNDS, shaders};
+use crate::gpu::{Buffer, Device, KernelVariant, LOOP_ROUNDS, VariantPair, shaders};
 
 /// Tile edge, pixels. Tiles of 8 evaluate 2.9 times the pairs that they blend, tiles of 16 six
 /// times (measured on the seeded scene).
@@ -21,7 +21,7 @@ pub enum TileBinning {
 impl TileBinning {
     /// The faster method for the device, unless it is disabled.
     pub fn of(device: &Device) -> TileBinning {
-        match KernelVariant::faster(device.info(), KernelVariant::CountedLists, KernelVariant::SortedLists) {
+        match VariantPair::LISTS.chosen(device.info()) {
             KernelVariant::CountedLists => TileBinning::Counting,
             _ => TileBinning::Sorting,
         }

@@ -55,7 +55,7 @@ pub fn run(plan: &RunPlan, progress: &dyn Progress) -> Result<RunOutcome> {
             // The graph reports an error where it needs networks.
             registry.compute().name().ok()
         });
-        plan.machine.open(plan.config.training.deterministic)
+        plan.machine.open(plan.config.training.deterministic, progress)
     })?;
     let max_size = plan.config.training.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let (mut photos, choice) = match &base {

@@ -2,10 +2,12 @@
 use super::budget;
 use super::config::ReconstructionConfig;
 use super::sources::SourceChoice;
+use crate::check;
 use crate::fit::{LanguageOptions, Preset, RgbOptions, ViewDependentOptions};
 use crate::gpu::{self, Device};
 use crate::infer::installed::inventory;
 use crate::infer::{Compute, Registry};
+use crate::progress::Progress;
 use crate::query::phrasing;
 use crate::scene::GivenCamera;
 use crate::{Error, Result};
@@ -174,14 +176,21 @@ impl Machine {
 
     /// The device.
     pub fn gpu(&self) -> Result<Device> {
-        self.open(false)
-    }
-
-    /// The device; one that is open already is as deterministic as it was opened.
-    pub(super) fn open(&self, deterministic: bool) -> Result<Device> {
         match &self.opened {
             Some(opened) => Ok(opened.device.clone()),
-            None => gpu::open_with(&gpu::Options { deterministic, ..gpu::options(self.device.as_deref()) }),
+            None => gpu::open(self.device.as_deref()),
+        }
+    }
+
+    /// The device for training, with the kernels that are fastest there ([`check::open`]); one that
+    /// is open already is as deterministic as it was opened.
+    pub(super) fn open(&self, deterministic: bool, progress: &dyn Progress) -> Result<Device> {
+        match &self.opened {
+            Some(opened) => Ok(opened.device.clone()),
+            None => {
+                let options = gpu::Options { deterministic, ..gpu::options(self.device.as_deref()) };
+                check::open(&options, progress)
+            }
         }
     }
 }

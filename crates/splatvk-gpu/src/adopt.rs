@@ -34,7 +34,7 @@ pub struct HostDevice {
 
 impl Device {
     /// Works on the host's device; it is not destroyed with the [`Device`]. Of `options` only
-    /// `staging`, `deterministic` and `disabled` count.
+    /// `staging`, `deterministic`, `disabled` and `preferred` count.
     ///
     /// # Safety
     /// The handles are valid, belong together, were made as `host` says, and outlive everything

@@ -1,5 +1,5 @@
-//! Bytes kept from one process to the next: compiled pipelines, and the kernel variants that gave
-//! wrong results on a device.
+//! Bytes kept from one process to the next: compiled pipelines, the kernel variants that gave wrong
+//! results on a device, and those that were faster there than the defaults.
 use ash::vk;
 use std::collections::BTreeSet;
 use std::fmt::{Debug, Write as _};
@@ -20,6 +20,9 @@ pub trait Cache: Debug + Send + Sync {
 
 /// Bytes of `VkPipelineCacheHeaderVersionOne`: length, version, vendor, device, UUID.
 const HEADER: usize = 16 + vk::UUID_SIZE;
+
+/// First line of the preferred kernel variants: without any, the file states that they were timed.
+const PREFERRED: &str = "preferred kernel variants\n";
 
 /// Names and headers of one driver's entries. Another driver version has other names.
 #[derive(Clone)]
@@ -57,6 +60,11 @@ impl Driver {
         format!("{}-{}.disabled", self.name, env!("CARGO_PKG_VERSION"))
     }
 
+    /// Another version of this crate may have faster kernels, so it starts anew.
+    fn preferred_name(&self) -> String {
+        format!("{}-{}.preferred", self.name, env!("CARGO_PKG_VERSION"))
+    }
+
     /// Compiled pipelines of an earlier process. Empty if there are none or another driver made
     /// them.
     pub fn pipelines(&self, cache: &dyn Cache) -> Vec<u8> {
@@ -85,6 +93,20 @@ impl Driver {
         }
         let lines: Vec<&str> = names.iter().map(String::as_str).collect();
         cache.write(&self.disabled_name(), lines.join("\n").as_bytes())
+    }
+
+    /// Names of the preferred kernel variants; `None` where nothing is kept that can be read.
+    pub fn preferred(&self, cache: &dyn Cache) -> Option<BTreeSet<String>> {
+        let text = String::from_utf8(cache.read(&self.preferred_name())?).ok()?;
+        Some(text.strip_prefix(PREFERRED)?.lines().map(str::to_owned).collect())
+    }
+
+    /// Replaces the names of the preferred kernel variants; `None` forgets them.
+    pub fn prefer(&self, cache: &dyn Cache, names: Option<&BTreeSet<String>>) -> io::Result<()> {
+        let lines =
+            |names: &BTreeSet<String>| names.iter().map(|name| format!("{name}\n")).collect::<String>();
+        let text = names.map(|names| format!("{PREFERRED}{}", lines(names))).unwrap_or_default();
+        cache.write(&self.preferred_name(), text.as_bytes())
     }
 }
 
@@ -144,6 +166,40 @@ mod tests {
         assert!(newer.disabled(&cache).is_empty());
         own.disable(&cache, &BTreeSet::new()).unwrap();
         assert!(own.disabled(&cache).is_empty());
+    }
+
+    #[test]
+    fn preferred_variants_return_to_their_driver_only() {
+        let (cache, own, newer) = (InMemory::default(), driver(1), driver(2));
+        assert_eq!(own.preferred(&cache), None);
+        let names = BTreeSet::from(["a".to_owned(), "b c".to_owned()]);
+        for names in [&names, &BTreeSet::new()] {
+            own.prefer(&cache, Some(names)).unwrap();
+            assert_eq!(own.preferred(&cache).as_ref(), Some(names));
+            assert_eq!(newer.preferred(&cache), None);
+        }
+        assert!(own.disabled(&cache).is_empty());
+        own.prefer(&cache, None).unwrap();
+        assert_eq!(own.preferred(&cache), None);
+        for damaged in [&b"a\n"[..], b"preferred kernel variants\n\xff"] {
+            cache.write(&own.preferred_name(), damaged).unwrap();
+            assert_eq!(own.preferred(&cache), None);
+        }
+    }
+
+    #[test]
+    fn opened_device_carries_preferred_variants() {
+        let cache = Arc::new(InMemory::default());
+        let options = Options { cache: Some(cache.clone()), ..Options::default() };
+        let names = BTreeSet::from(["a".to_owned()]);
+        let device = Device::open(&options).unwrap();
+        assert_eq!(device.info().preferred, None);
+        device.prefer(cache.as_ref(), Some(&names)).unwrap();
+        assert_eq!(device.preferred(cache.as_ref()), Some(names.clone()));
+        assert_eq!(Device::open(&options).unwrap().info().preferred, Some(names));
+        assert_eq!(crate::survey(&options).unwrap().chosen.unwrap().preferred.unwrap().len(), 1);
+        let given = Options { preferred: Some(BTreeSet::new()), ..options };
+        assert_eq!(Device::open(&given).unwrap().info().preferred, Some(BTreeSet::new()));
     }
 
     #[test]

@@ -164,6 +164,20 @@ impl Device {
         self.0.driver.disable(cache, names)
     }
 
+    /// Prefers these kernel variants to the defaults, for each process that opens this device with
+    /// its driver and this cache; `None` forgets them.
+    ///
+    /// # Errors
+    /// Those of the cache.
+    pub fn prefer(&self, cache: &dyn Cache, names: Option<&BTreeSet<String>>) -> std::io::Result<()> {
+        self.0.driver.prefer(cache, names)
+    }
+
+    /// Preferred kernel variants that a cache keeps for this device and driver; `None` without any.
+    pub fn preferred(&self, cache: &dyn Cache) -> Option<BTreeSet<String>> {
+        self.0.driver.preferred(cache)
+    }
+
     /// Names of the shaders that were run so far.
     #[cfg(feature = "testing")]
     pub fn shaders_run(&self) -> BTreeSet<&'static str> {

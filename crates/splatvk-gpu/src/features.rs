@@ -209,6 +209,7 @@ fn describe(
         float_atomics,
         deterministic: options.deterministic,
         disabled: options.disabled.clone(),
+        preferred: options.preferred.clone(),
         capabilities: capabilities(offer, &v11, float_atomics),
         max_storage_range: u64::from(limits.max_storage_buffer_range)
             .min(options.max_binding.unwrap_or(u64::MAX)),

@@ -32,8 +32,8 @@ pub struct Options {
     /// No buffer larger than this, bytes, although the device would bind more: to test what is done
     /// in blocks.
     pub max_binding: Option<u64>,
-    /// Keeps compiled pipelines, and the kernel variants that are disabled on a device, from one
-    /// process to the next. Not used on a host's device.
+    /// Keeps compiled pipelines, and the kernel variants that are disabled or preferred on a device,
+    /// from one process to the next. Not used on a host's device.
     pub cache: Option<Arc<dyn Cache>>,
     /// Native code in place of shaders, where the device is the processor and buffers are mapped.
     /// Not used on a host's device.
@@ -41,6 +41,9 @@ pub struct Options {
     /// Names of kernel variants not to be used. The crate itself knows [`NATIVE_FLOAT_ATOMICS`];
     /// the others are the program's, which finds them in [`DeviceInfo::disabled`].
     pub disabled: BTreeSet<String>,
+    /// Names of kernel variants to be used in place of the defaults, which the program finds in
+    /// [`DeviceInfo::preferred`]; `None`: those that the cache keeps.
+    pub preferred: Option<BTreeSet<String>>,
 }
 
 /// Rounds after which lavapipe leaves the loops of a shader, all of them together, and says nothing
@@ -79,6 +82,9 @@ pub struct DeviceInfo {
     pub float_atomics: bool,
     /// Names of the kernel variants that are not used here ([`Options::disabled`]).
     pub disabled: BTreeSet<String>,
+    /// Names of the kernel variants that were faster here than the defaults; `None` where nothing
+    /// is remembered ([`Options::preferred`]).
+    pub preferred: Option<BTreeSet<String>>,
     /// Capabilities that shaders may use here.
     pub capabilities: BTreeSet<Capability>,
     /// Largest buffer a shader can see, bytes.
@@ -105,11 +111,13 @@ impl DeviceInfo {
 }
 
 impl Options {
-    /// The options with the variants that the cache names as disabled on a device.
+    /// The options with the variants that the cache names as disabled or preferred on a device.
     pub(crate) fn for_device(&self, properties: &vk::PhysicalDeviceProperties) -> Options {
         let mut options = self.clone();
         if let Some(cache) = &self.cache {
-            options.disabled.extend(Driver::new(properties).disabled(cache.as_ref()));
+            let driver = Driver::new(properties);
+            options.disabled.extend(driver.disabled(cache.as_ref()));
+            options.preferred = options.preferred.or_else(|| driver.preferred(cache.as_ref()));
         }
         options
     }

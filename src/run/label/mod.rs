@@ -66,7 +66,7 @@ pub(super) fn run(plan: &RunPlan, path: &Path, progress: &dyn Progress) -> Resul
         true => None,
         false => Some(Workspace::create(&output.out, output.force, &read)?),
     };
-    let device = plan.machine.open(plan.config.training.deterministic)?;
+    let device = plan.machine.open(plan.config.training.deterministic, progress)?;
     let max_size = plan.config.training.max_size.unwrap_or(photo::default_max_size(device.info().is_cpu));
     let mut renderer = Renderer::new(&device, &scene.splats, &[], 0)?;
     let Views { photos, cameras, frames } =
