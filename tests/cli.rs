@@ -83,21 +83,26 @@ fn heic_without_library_explains_installation() {
 #[test]
 fn doctor_compares_all_passes() {
     let home = tempfile::tempdir().unwrap();
-    let table = doctor_check(home.path(), &[]);
-    assert!(
-        table.lines().count() > 15 && table.lines().skip(1).all(|line| line.starts_with("ok ")),
-        "{table}"
-    );
-    let report: serde_json::Value = serde_json::from_str(&doctor_check(home.path(), &["--json"])).unwrap();
+    let table = doctor_check(home.path(), &[], "");
+    let (timed, rows): (Vec<&str>, Vec<&str>) = table.lines().skip(1).partition(|l| l.starts_with("timed "));
+    assert!(rows.len() > 15 && rows.iter().all(|line| line.starts_with("ok ")), "{table}");
+    let is_kept = || names(&home.path().join("cache")).iter().any(|name| name.ends_with(".preferred"));
+    assert_eq!(is_kept(), !timed.is_empty());
+    let report = doctor_check(home.path(), &["--json"], "native passes");
+    let report: serde_json::Value = serde_json::from_str(&report).unwrap();
     assert_eq!(report["right"], true);
     assert_eq!(report["switched_off"], serde_json::json!([]));
-    assert_eq!(report["passes"].as_array().unwrap().len(), table.lines().count() - 1);
+    assert_eq!(report["passes"].as_array().unwrap().len(), rows.len());
+    let timed = report["timed"].as_array().unwrap();
+    assert!(timed.len() == 7 && is_kept(), "{timed:?}");
+    assert!(timed.iter().all(|t| t["ways"].as_array().unwrap().contains(&t["chosen"])), "{timed:?}");
 }
 
-/// Output of `splatvk doctor --check`.
-fn doctor_check(home: &Path, arguments: &[&str]) -> String {
-    let output = splatvk().arg("doctor").arg("--check").args(arguments).env("SPLATVK_HOME", home).output();
-    let output = output.unwrap();
+/// Output of `splatvk doctor --check` without some kernel variants.
+fn doctor_check(home: &Path, arguments: &[&str], disabled: &str) -> String {
+    let mut command = splatvk();
+    command.arg("doctor").arg("--check").args(arguments).env("SPLATVK_HOME", home);
+    let output = command.env("SPLATVK_DISABLE", disabled).output().unwrap();
     assert!(output.status.success(), "{}", text(&output.stderr));
     text(&output.stdout)
 }

@@ -4,8 +4,9 @@ use crate::gpu::{KernelVariant, VariantPair};
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
-/// Time that a variant must save, as a share of the time of the present one. Medians of a pass
-/// repeat to 1–2 % on a GPU without other work, so that repeated choices agree.
+/// Time that a variant must save, as a share of the time of the present one. A smaller gain is not
+/// worth a change that the next timing may take back: the ratios of five timings on lavapipe, beside
+/// other work, spread by 3 to 27 %.
 pub const MARGIN: f64 = 0.05;
 
 /// Wall-clock limit of a choice: longer, a first run would look stuck.
@@ -27,14 +28,37 @@ pub struct Choice {
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub enum Timing {
-    /// Median milliseconds of both.
-    Measured([f64; 2]),
+    /// Both were run.
+    Measured(Times),
     /// One or both gave wrong results, and neither was timed.
     Wrong,
     /// The device cannot run one of them.
     Unusable,
     /// The time was over before.
     OutOfTime,
+}
+
+/// Times of two variants that were run in turn.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub struct Times {
+    /// Median milliseconds.
+    pub medians: [f64; 2],
+    /// Median over the rounds of the second time, divided by the first. A clock that changes
+    /// between the rounds changes the medians by its factor, but not this ratio.
+    pub ratio: f64,
+}
+
+impl Times {
+    /// Medians of rounds of milliseconds; zero without any.
+    pub fn of(rounds: &[[f64; 2]]) -> Times {
+        let median = |value: fn(&[f64; 2]) -> f64| {
+            let mut values: Vec<f64> = rounds.iter().map(value).collect();
+            values.sort_by(f64::total_cmp);
+            values.get(values.len() / 2).copied().unwrap_or_default()
+        };
+        Times { medians: [median(|r| r[0]), median(|r| r[1])], ratio: median(|r| r[1] / r[0]) }
+    }
 }
 
 /// Chooses for each pair: the correct variant, or the faster one if both are correct and it saves
@@ -73,9 +97,9 @@ pub fn choose(
 
 /// The present variant, unless the other one was faster by [`MARGIN`].
 fn faster(variants: [KernelVariant; 2], present: KernelVariant, timing: Timing) -> KernelVariant {
-    let Timing::Measured(times) = timing else { return present };
-    let [of_present, of_other] = if variants[0] == present { times } else { [times[1], times[0]] };
-    if of_other < (1.0 - MARGIN) * of_present { present.replacement() } else { present }
+    let Timing::Measured(Times { ratio, .. }) = timing else { return present };
+    let of_other = if variants[0] == present { ratio } else { 1.0 / ratio };
+    if of_other < 1.0 - MARGIN { present.replacement() } else { present }
 }
 
 /// Names to remember: the variants that were faster than the defaults. The replacement of a wrong
@@ -91,6 +115,16 @@ mod tests {
 
     const LISTS: [KernelVariant; 2] = [KernelVariant::SortedLists, KernelVariant::CountedLists];
 
+    fn measured(times: [f64; 2]) -> Result<Timing> {
+        Ok(Timing::Measured(Times::of(&[times])))
+    }
+
+    #[test]
+    fn changing_clock_keeps_ratio() {
+        let times = Times::of(&[[10.0, 16.0], [10.0, 16.0], [10.0, 8.0], [5.0, 8.0], [5.0, 8.0]]);
+        assert_eq!(times, Times { medians: [10.0, 8.0], ratio: 1.6 });
+    }
+
     fn later() -> Instant {
         Instant::now() + Duration::from_secs(60)
     }
@@ -101,7 +135,7 @@ mod tests {
         let wrong: BTreeSet<KernelVariant> = wrong.iter().copied().collect();
         let time = |variants: [KernelVariant; 2], _: &BTreeSet<String>| {
             assert!(variants.iter().all(|v| !wrong.contains(v)), "{variants:?}");
-            Ok(Timing::Measured(if variants == LISTS { times } else { [1.0; 2] }))
+            measured(if variants == LISTS { times } else { [1.0; 2] })
         };
         let choices = choose(false, &remembered, &wrong, later(), time).unwrap();
         assert_eq!(choices.len(), VariantPair::TIMED.len());
@@ -139,7 +173,7 @@ mod tests {
         let time = |_: [KernelVariant; 2], _: &BTreeSet<String>| {
             timed += 1;
             std::thread::sleep(until.saturating_duration_since(Instant::now()));
-            Ok(Timing::Measured([1.0, 0.5]))
+            measured([1.0, 0.5])
         };
         let choices = choose(false, &remembered, &BTreeSet::new(), until, time).unwrap();
         assert_eq!(timed, 1);
@@ -153,7 +187,7 @@ mod tests {
         let mut seen = Vec::new();
         let time = |variants: [KernelVariant; 2], preferred: &BTreeSet<String>| {
             seen.push(preferred.clone());
-            Ok(Timing::Measured(if variants[0] == KernelVariant::ChunkSort { [2.0, 1.0] } else { [1.0; 2] }))
+            measured(if variants[0] == KernelVariant::ChunkSort { [2.0, 1.0] } else { [1.0; 2] })
         };
         choose(true, &BTreeSet::new(), &BTreeSet::new(), later(), time).unwrap();
         let sweep = BTreeSet::from([KernelVariant::SweepSort.name().to_owned()]);

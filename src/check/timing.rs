@@ -1,5 +1,5 @@
 //! Times of kernel variants on a seeded scene, by timestamps on the device.
-use super::choose::{self, Choice, Timing};
+use super::choose::{self, Choice, Times, Timing};
 use crate::gpu::{Device, KernelVariant, Options, Program, Recorder};
 use crate::math::Random;
 use crate::pass::adam::{Class, Moments, Schedule};
@@ -31,7 +31,7 @@ impl SceneSize {
     /// times as long.
     fn of(is_cpu: bool) -> SceneSize {
         match is_cpu {
-            true => SceneSize { splats: 10_000, pixels: [320, 240] },
+            true => SceneSize { splats: 40_000, pixels: [320, 240] },
             false => SceneSize { splats: 150_000, pixels: [640, 480] },
         }
     }
@@ -40,7 +40,7 @@ impl SceneSize {
 /// Runs before the first measured one: the driver compiles in the first, caches settle in the next.
 const WARM_UP: usize = 2;
 /// Fewest measured runs of a variant, for a median.
-const FEWEST: usize = 5;
+const FEWEST: usize = 7;
 /// Most measured runs.
 const MOST: usize = 101;
 /// Measurement of a pair beyond [`FEWEST`] runs, for GPUs, where a pass takes a tenth of a
@@ -117,17 +117,15 @@ impl Timer {
             recorded.iter().try_for_each(|r| r.milliseconds(&self.device).map(drop))?;
         }
         // In turn: both see the same clocks and the same other work.
-        let mut times = [Vec::new(), Vec::new()];
-        let begun = Instant::now();
-        while times[0].len() < MOST && (times[0].len() < FEWEST || begun.elapsed() < PAIR) {
+        let [a, b] = &recorded;
+        let (mut rounds, begun) = (Vec::new(), Instant::now());
+        while rounds.len() < MOST && (rounds.len() < FEWEST || begun.elapsed() < PAIR) {
             if Instant::now() >= self.until {
                 break;
             }
-            for (times, recorded) in times.iter_mut().zip(&recorded) {
-                times.push(recorded.milliseconds(&self.device)?);
-            }
+            rounds.push([a.milliseconds(&self.device)?, b.milliseconds(&self.device)?]);
         }
-        Ok(if times[0].len() < FEWEST { Timing::OutOfTime } else { Timing::Measured(times.map(median)) })
+        Ok(if rounds.len() < FEWEST { Timing::OutOfTime } else { Timing::Measured(Times::of(&rounds)) })
     }
 
     /// A variant's pass, with those before it that cannot be left out; `None` where the device
@@ -329,11 +327,6 @@ impl Compiled {
     }
 }
 
-fn median(mut times: Vec<f64>) -> f64 {
-    times.sort_by(f64::total_cmp);
-    times[times.len() / 2]
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -359,7 +352,9 @@ mod tests {
         for Choice { variants, chosen, timing } in &choices {
             assert!(variants.contains(chosen));
             match timing {
-                Timing::Measured(times) => assert!(times.iter().all(|t| *t > 0.0), "{variants:?} {times:?}"),
+                Timing::Measured(times) => {
+                    assert!(times.medians.iter().all(|t| *t > 0.0), "{variants:?} {times:?}");
+                }
                 Timing::Wrong => assert!(variants.contains(&KernelVariant::SsimShared)),
                 Timing::OutOfTime => assert!(begun.elapsed() > choose::LIMIT),
                 Timing::Unusable => assert!(!fused_update::fits(crate::gpu::test_device().info())),

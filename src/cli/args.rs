@@ -427,7 +427,8 @@ pub struct DoctorArgs {
     pub device: DeviceArgs,
     /// Run every GPU pass on the device and compare it with the same computation on the CPU: a
     /// table for bug reports. What gives wrong results there and can be replaced is not used on
-    /// this device and driver from then on
+    /// this device and driver from then on. Of kernels that replace each other the faster ones are
+    /// used
     #[arg(long)]
     pub check: bool,
 }

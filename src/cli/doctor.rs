@@ -3,6 +3,7 @@ use super::args::DoctorArgs;
 use super::models;
 use super::print::{print, print_json};
 use super::progress;
+use crate::check::choose::{self, Choice, LIMIT, Timing};
 use crate::check::{self, Row};
 use crate::gpu::report::{Line, Status, vulkan};
 use crate::gpu::{self, Device, FolderCache, Options};
@@ -14,6 +15,7 @@ use crate::{Error, Result};
 use serde_json::json;
 use std::collections::BTreeSet;
 use std::fmt::Write;
+use std::time::Instant;
 
 pub fn doctor(args: &DoctorArgs) -> Result<()> {
     if args.check {
@@ -78,8 +80,8 @@ pub fn doctor(args: &DoctorArgs) -> Result<()> {
     }
 }
 
-/// Compares every pass with its CPU reference, and disables wrong kernel variants that have a
-/// replacement.
+/// Compares every pass with its CPU reference, disables wrong kernel variants that have a
+/// replacement, and times the others.
 fn check_passes(args: &DoctorArgs) -> Result<()> {
     // No variant is disabled, and without the cache the driver compiles every shader.
     let options =
@@ -108,15 +110,23 @@ fn check_passes(args: &DoctorArgs) -> Result<()> {
     })?;
     let off = check::wrong_variants(&rows);
     let names: Vec<&str> = off.iter().map(|v| v.name()).collect();
-    if let Some(cache) = FolderCache::own() {
-        device.disable(&cache, &check::names(&off)).map_err(Error::io(cache.path()))?;
+    let cache = FolderCache::own();
+    if let Some(cache) = &cache {
+        device.disable(cache, &check::names(&off)).map_err(Error::io(cache.path()))?;
     }
+    let choices = time_variants(&device, &options, &rows, cache.as_ref())?;
     let fatal = rows.iter().filter(|r| check::is_fatal(r, &off)).count();
     if json {
         let rows: Vec<_> = rows.iter().map(to_json).collect();
-        print_json(&json!({ "device": about, "right": fatal == 0, "switched_off": names, "passes": rows }))?;
-    } else if !off.is_empty() {
-        print(&format!("switched off on this device with this driver: {}\n", names.join(", ")))?;
+        let timed: Vec<_> = choices.iter().map(choice_to_json).collect();
+        print_json(&json!({
+            "device": about, "right": fatal == 0, "switched_off": names, "passes": rows, "timed": timed
+        }))?;
+    } else {
+        if !off.is_empty() {
+            print(&format!("switched off on this device with this driver: {}\n", names.join(", ")))?;
+        }
+        choices.iter().try_for_each(|choice| print(&choice_text(choice)))?;
     }
     match fatal {
         0 => Ok(()),
@@ -136,6 +146,55 @@ fn text(row: &Row) -> String {
     };
     let pass = row.variant.map_or(row.pass.to_owned(), |variant| format!("{}, {}", row.pass, variant.name()));
     format!("{word:<6} {pass:<52} {:>6} ms  {found}\n", row.time.as_millis())
+}
+
+/// Times the kernel variants and keeps the names of those that were faster than the defaults;
+/// nothing where native code replaces the shaders.
+fn time_variants(
+    device: &Device,
+    options: &Options,
+    rows: &[Row],
+    cache: Option<&FolderCache>,
+) -> Result<Vec<Choice>> {
+    if gpu::replaces_shaders(device.info(), &gpu::options(None).disabled) {
+        return Ok(Vec::new());
+    }
+    let remembered = cache.and_then(|cache| device.preferred(cache)).unwrap_or_default();
+    let (wrong, until) = (check::wrong(rows), Instant::now() + LIMIT);
+    let mut stop = || progress::reporter().check();
+    let choices = check::time_variants(options, None, &remembered, &wrong, until, &mut stop)?;
+    if let Some(cache) = cache {
+        let preferred = choose::preferred(&choices);
+        device.prefer(cache, Some(&preferred)).map_err(Error::io(cache.path()))?;
+    }
+    Ok(choices)
+}
+
+fn choice_text(choice: &Choice) -> String {
+    let [a, b] = choice.variants.map(|v| v.name());
+    let pair = match choice.timing {
+        Timing::Measured(times) => {
+            let [of_a, of_b] = times.medians;
+            format!("{a} {of_a:.3} ms, {b} {of_b:.3} ms, {:.2}×", times.ratio)
+        }
+        Timing::Wrong => format!("{a}, {b}: one is wrong"),
+        Timing::Unusable => format!("{a}, {b}: the device runs one only"),
+        Timing::OutOfTime => format!("{a}, {b}: no time left"),
+    };
+    format!("timed  {pair:<80} → {}\n", choice.chosen.name())
+}
+
+fn choice_to_json(choice: &Choice) -> serde_json::Value {
+    let times = match choice.timing {
+        Timing::Measured(times) => Some(times),
+        _ => None,
+    };
+    json!({
+        "ways": choice.variants.map(|v| v.name()),
+        "milliseconds": times.map(|t| t.medians),
+        "ratio": times.map(|t| t.ratio),
+        "chosen": choice.chosen.name(),
+    })
 }
 
 fn to_json(row: &Row) -> serde_json::Value {

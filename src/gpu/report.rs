@@ -1,5 +1,6 @@
 //! The lines of `splatvk doctor` about Vulkan.
 use super::options::options;
+use super::variants::VariantPair;
 use splatvk_gpu::{DeviceInfo, Error, INSTALL, Survey, Surveyed, survey};
 
 /// Judgement of a line of the report.
@@ -114,6 +115,7 @@ fn describe(info: &DeviceInfo, lines: &mut Vec<Line>) {
             "by doctor --check (wrong results; an update of the driver starts anew) or by SPLATVK_DISABLE";
         lines.push(line("switched off", Status::Note, names.join(", "), Some(advice)));
     }
+    lines.extend(preferred(info));
     let mib = |bytes: u64| bytes >> 20;
     // A set of 20 channels at 1 Mpixel in f32 takes 80 MB; Vulkan guarantees 128 MiB.
     lines.push(line(
@@ -130,9 +132,38 @@ fn describe(info: &DeviceInfo, lines: &mut Vec<Line>) {
     ));
 }
 
+/// A line on the remembered kernel variants that replace the defaults, where they do.
+fn preferred(info: &DeviceInfo) -> Option<Line> {
+    let replaced = VariantPair::TIMED.into_iter().filter_map(|pair| {
+        let (default, chosen) = (pair.variants(info.is_cpu)[0], pair.chosen(info));
+        let is_preferred = info.preferred.as_ref().is_some_and(|names| names.contains(chosen.name()));
+        (chosen != default && is_preferred).then(|| format!("{} ({})", chosen.name(), default.name()))
+    });
+    let replaced: Vec<String> = replaced.collect();
+    let advice = "faster here than the kernels in brackets; doctor --check times them again";
+    (!replaced.is_empty()).then(|| line("faster kernels", Status::Note, replaced.join(", "), Some(advice)))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::KernelVariant;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn preferred_variants_are_shown() {
+        let names = |variants: &[KernelVariant]| -> BTreeSet<String> {
+            variants.iter().map(|v| v.name().to_owned()).collect()
+        };
+        let mut info = DeviceInfo::default();
+        assert!(preferred(&info).is_none());
+        info.preferred = Some(BTreeSet::from(["unknown".to_owned(), "sort in one sweep".to_owned()]));
+        assert!(preferred(&info).is_none(), "the default of a GPU");
+        info.preferred = Some(names(&[KernelVariant::ChunkSort, KernelVariant::SsimStrips]));
+        info.disabled = names(&[KernelVariant::SsimStrips]);
+        let line = preferred(&info).unwrap();
+        assert_eq!(line.found, "sort in chunks (sort in one sweep)");
+    }
 
     #[test]
     fn report_names_device_and_unknown_choice() {
