@@ -173,7 +173,25 @@ mod tests {
         let options = Options { cache: Some(cache.clone()), ..gpu::options(None) };
         let device = gpu::open_with(&options).unwrap();
         assert_eq!(device.info().preferred, None);
-        choose_once(device, &cache, &options, (limit, None), told)
+        let size = SceneSize { splats: 1000, pixels: [96, 64] };
+        choose_once(device, &cache, &options, (limit, Some(size)), told)
+    }
+
+    #[test]
+    fn choice_is_kept_and_used() {
+        let (cache, told, begun) = (Arc::new(InMemory::default()), Told::default(), Instant::now());
+        let device = chosen(cache.clone(), LIMIT, &told).unwrap();
+        // A pair that has begun ends after its next runs, and devices are opened before and after.
+        assert!(begun.elapsed() < LIMIT + Duration::from_secs(3), "{:?}", begun.elapsed());
+        let kept = device.preferred(cache.as_ref()).unwrap();
+        assert_eq!(device.info().preferred.as_ref(), Some(&kept));
+        let is_cpu = device.info().is_cpu;
+        let others: BTreeSet<String> =
+            VariantPair::TIMED.iter().map(|pair| pair.variants(is_cpu)[1].name().to_owned()).collect();
+        assert!(kept.is_subset(&others), "{kept:?}");
+        assert!(device.info().disabled.is_empty(), "{:?}", device.info().disabled);
+        assert_eq!(lock(&told.lines)[0], "choosing the fastest kernels for this device, once");
+        println!("{:?}: {kept:?} {:?}", begun.elapsed(), lock(&told.lines));
     }
 
     #[test]

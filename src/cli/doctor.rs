@@ -149,14 +149,15 @@ fn text(row: &Row) -> String {
 }
 
 /// Times the kernel variants and keeps the names of those that were faster than the defaults;
-/// nothing where native code replaces the shaders.
+/// nothing where native code replaces the shaders, or under validation, which takes longer for some
+/// shaders than for others.
 fn time_variants(
     device: &Device,
     options: &Options,
     rows: &[Row],
     cache: Option<&FolderCache>,
 ) -> Result<Vec<Choice>> {
-    if gpu::replaces_shaders(device.info(), &gpu::options(None).disabled) {
+    if options.validation || gpu::replaces_shaders(device.info(), &gpu::options(None).disabled) {
         return Ok(Vec::new());
     }
     let remembered = cache.and_then(|cache| device.preferred(cache)).unwrap_or_default();

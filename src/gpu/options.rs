@@ -25,12 +25,13 @@ pub fn open_with(options: &Options) -> crate::Result<Device> {
 }
 
 /// Whether kernel variants may be timed at the first use of a device that is opened with these
-/// options. Without a cache every process would time them; with disabled variants, results and
-/// times are those of a test; a deterministic device uses no preferences. `SPLATVK_TUNE=0` turns it
-/// off.
+/// options. Without a cache every process would time them; with disabled variants or validation,
+/// times are not those of usual runs; a deterministic device uses no preferences. `SPLATVK_TUNE=0`
+/// turns it off.
 pub fn may_choose_kernels(options: &Options) -> bool {
     let off = std::env::var("SPLATVK_TUNE").is_ok_and(|v| v == "0");
-    !off && options.cache.is_some() && options.disabled.is_empty() && !options.deterministic
+    let Options { cache, disabled, deterministic, validation, .. } = options;
+    !off && cache.is_some() && disabled.is_empty() && !deterministic && !validation
 }
 
 fn check_disabled(options: &Options) -> crate::Result<()> {
@@ -75,6 +76,18 @@ pub fn options(choice: Option<&str>) -> Options {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn kernels_are_chosen_in_usual_runs() {
+        let cache: Option<Arc<dyn Cache>> = Some(Arc::new(FolderCache::own().unwrap()));
+        let usual = Options { cache, ..Options::default() };
+        assert_eq!(may_choose_kernels(&usual), std::env::var("SPLATVK_TUNE").as_deref() != Ok("0"));
+        assert!(!may_choose_kernels(&Options { cache: None, ..usual.clone() }));
+        assert!(!may_choose_kernels(&Options { deterministic: true, ..usual.clone() }));
+        assert!(!may_choose_kernels(&Options { validation: true, ..usual.clone() }));
+        let disabled = [KernelVariant::FusedUpdate.name().to_owned()].into();
+        assert!(!may_choose_kernels(&Options { disabled, ..usual }));
+    }
 
     #[test]
     fn unknown_variants_are_refused() {
