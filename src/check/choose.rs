@@ -5,8 +5,8 @@ use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 /// Time that a variant must save, as a share of the time of the present one. A smaller gain is not
-/// worth a change that the next timing may take back: the ratios of five timings on lavapipe, beside
-/// other work, spread by 3 to 27 %.
+/// worth a change that the next timing may take back: the ratios of five timings on lavapipe,
+/// beside other work, spread by 3 to 27 %.
 pub const MARGIN: f64 = 0.05;
 
 /// Wall-clock limit of a choice: longer, a first run would look stuck.

@@ -1,6 +1,6 @@
 //! Compares every pass on a device with its CPU reference, in seconds: `splatvk doctor --check`.
-//! Variants that gave wrong results are disabled for this device and driver ([`KernelVariant`]), and
-//! the faster of two correct ones is preferred ([`choose`]).
+//! Variants that gave wrong results are disabled for this device and driver ([`KernelVariant`]),
+//! and the faster of two correct ones is preferred ([`choose`]).
 pub mod choose;
 mod compared;
 mod data;

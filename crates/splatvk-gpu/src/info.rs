@@ -32,8 +32,8 @@ pub struct Options {
     /// No buffer larger than this, bytes, although the device would bind more: to test what is done
     /// in blocks.
     pub max_binding: Option<u64>,
-    /// Keeps compiled pipelines, and the kernel variants that are disabled or preferred on a device,
-    /// from one process to the next. Not used on a host's device.
+    /// Keeps compiled pipelines, and the kernel variants that are disabled or preferred on a
+    /// device, from one process to the next. Not used on a host's device.
     pub cache: Option<Arc<dyn Cache>>,
     /// Native code in place of shaders, where the device is the processor and buffers are mapped.
     /// Not used on a host's device.
