@@ -5,9 +5,11 @@ use crate::math::Random;
 use crate::pass::adam::{Class, Moments, Schedule};
 use crate::pass::bands::Bands;
 use crate::pass::fused_update::{self, SplatAdam};
+use crate::pass::project::DEPTH_BITS;
 use crate::pass::regularise::{self, RatioPenalty};
 use crate::pass::sort::{Sort, SortAlgorithm};
 use crate::pass::ssim_l1::{SsimL1, SsimRowKernel};
+use crate::pass::sum::PARTIALS;
 use crate::pass::{
     DeviceChoices, GradientReduction, RasterOptions, Rasterizer, ShGradientKernel, SplatBuffers, TileBinning,
     TileSums, View,
@@ -170,7 +172,7 @@ impl Timer {
         rec.pass("restore the unsorted keys");
         rec.copy(&unsorted, &sorted);
         rec.pass("depth sort");
-        sort.record(&mut rec, &sorted, &counted, u32::BITS);
+        sort.record(&mut rec, &sorted, &counted, DEPTH_BITS);
         Ok(Recorded { rec, passes: &["depth sort"] })
     }
 
@@ -231,7 +233,7 @@ impl Timer {
         let rendered = self.device.buffer_from("rendered", &noise())?;
         let target = self.device.buffer_from("target", &noise())?;
         let gradient = self.device.buffer::<f32>("gradient", 3 * width * height)?;
-        let sums = self.device.buffer::<f32>("loss", 2)?;
+        let sums = self.device.buffer::<f32>("loss", 2 * PARTIALS)?;
         let bands = Bands::whole(width, height);
         let pass = SsimL1::with(&self.device, std::slice::from_ref(&bands), rows)?;
         let mut rec = Recorder::new(&self.device, "timing of SSIM");
