@@ -6,6 +6,7 @@ use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::ssim::{C1, C2, HALF, STRIP, WINDOW};
 use fearless_simd::{Level, Simd, dispatch, f32x8, prelude::*};
 use rayon::prelude::*;
+use std::ops::Range;
 
 const REACH: usize = HALF as usize;
 const ROWS: usize = STRIP as usize;
@@ -30,25 +31,47 @@ fn blur<S: Simd>(simd: S, tap: impl Fn(usize) -> f32x8<S>) -> f32x8<S> {
     sum
 }
 
-/// Row `k` of the vertical blurs of some planes.
+/// Reads the numbers of a block of columns, of which those beyond `from` are 0.
 #[inline(always)]
-fn blur_columns<S: Simd, const N: usize>(simd: S, rows: &[Rows; N], k: usize) -> [[f32; BLOCK]; N] {
-    let mut out = [[0.0; BLOCK]; N];
-    for (rows, out) in rows.iter().zip(&mut out) {
-        for (block, out) in out.chunks_exact_mut(LANES).enumerate() {
-            let at = block * LANES;
-            blur(simd, |tap| f32x8::from_slice(simd, &rows[k + tap][at..at + LANES])).store_slice(out);
-        }
+fn read<S: Simd>(simd: S, from: &[f32], block: &mut [f32; BLOCK]) {
+    // A whole block is copied in registers: a call of memmove takes longer.
+    let Some(from) = from.first_chunk::<BLOCK>() else {
+        block[..from.len()].copy_from_slice(from);
+        return block[from.len()..].fill(0.0);
+    };
+    for (from, to) in from.chunks_exact(LANES).zip(block.chunks_exact_mut(LANES)) {
+        f32x8::from_slice(simd, from).store_slice(to);
     }
-    out
+}
+
+/// Writes the numbers of a block of columns that lie in `to`.
+#[inline(always)]
+fn write<S: Simd>(simd: S, block: &[f32; BLOCK], to: &mut [f32]) {
+    let Some(to) = to.first_chunk_mut::<BLOCK>() else {
+        return to.copy_from_slice(&block[..to.len()]);
+    };
+    for (from, to) in block.chunks_exact(LANES).zip(to.chunks_exact_mut(LANES)) {
+        f32x8::from_slice(simd, from).store_slice(to);
+    }
+}
+
+/// Row `k` of the vertical blur of a plane.
+#[inline(always)]
+fn blur_columns<S: Simd>(simd: S, rows: &Rows, k: usize, out: &mut [f32; BLOCK]) {
+    // One check of bounds instead of one per number.
+    let Some(rows) = rows[k..].first_chunk::<TAPS>() else { return };
+    for (block, out) in out.chunks_exact_mut(LANES).enumerate() {
+        let at = block * LANES;
+        blur(simd, |tap| f32x8::from_slice(simd, &rows[tap][at..at + LANES])).store_slice(out);
+    }
 }
 
 /// Horizontal blur of a row that begins [`REACH`] before the first output.
 #[inline(always)]
 fn blur_row<S: Simd>(simd: S, row: &[f32], out: &mut [f32]) {
     for (block, out) in out.chunks_exact_mut(LANES).enumerate() {
-        let at = block * LANES;
-        blur(simd, |tap| f32x8::from_slice(simd, &row[at + tap..][..LANES])).store_slice(out);
+        let Some(row) = row[block * LANES..].first_chunk::<{ LANES + TAPS - 1 }>() else { return };
+        blur(simd, |tap| f32x8::from_slice(simd, &row[tap..tap + LANES])).store_slice(out);
     }
 }
 
@@ -61,7 +84,7 @@ struct Strips {
 impl Strips {
     /// Places of the rows that a strip reads in a block of columns that begins at `x`; `None` for
     /// those outside of the image.
-    fn rows(&self, strip: usize, x: usize) -> impl Iterator<Item = Option<std::ops::Range<usize>>> {
+    fn rows(&self, strip: usize, x: usize) -> impl Iterator<Item = Option<Range<usize>>> {
         let (width, height) = (self.width, self.height);
         (0..READ).map(move |i| {
             let y = (strip * ROWS + i).checked_sub(REACH).filter(|y| *y < height)?;
@@ -103,9 +126,9 @@ impl<'a> Images<'a> {
 
     /// Values of the pixels of `at` in both; a pixel of weight 0 has that of the target.
     #[inline(always)]
-    fn values(&self, at: std::ops::Range<usize>, x: &mut [f32], y: &mut [f32]) {
-        x.copy_from_slice(&self.x[at.clone()]);
-        y.copy_from_slice(&self.y[at.clone()]);
+    fn values<S: Simd>(&self, simd: S, at: Range<usize>, x: &mut [f32; BLOCK], y: &mut [f32; BLOCK]) {
+        read(simd, &self.x[at.clone()], x);
+        read(simd, &self.y[at.clone()], y);
         if let Some(weights) = self.weights {
             x.iter_mut().zip(&*y).zip(&weights[at]).for_each(|((x, y), w)| *x = w * (*x - y) + y);
         }
@@ -142,9 +165,9 @@ fn strip_columns<S: Simd>(simd: S, image: &Strips, strip: usize, images: &Images
         let columns = BLOCK.min(image.width - first);
         for (i, at) in image.rows(strip, first).enumerate() {
             let [x, y, squares, products] = rows.each_mut().map(|rows| &mut rows[i]);
-            [&mut *x, &mut *y].into_iter().for_each(|row| row.fill(0.0));
-            if let Some(at) = at {
-                images.values(at, &mut x[..columns], &mut y[..columns]);
+            match at {
+                Some(at) => images.values(simd, at, x, y),
+                None => [&mut *x, &mut *y].into_iter().for_each(|row| row.fill(0.0)),
             }
             for k in (0..BLOCK).step_by(LANES) {
                 let [u, v] = [&*x, &*y].map(|row| f32x8::from_slice(simd, &row[k..k + LANES]));
@@ -153,10 +176,11 @@ fn strip_columns<S: Simd>(simd: S, image: &Strips, strip: usize, images: &Images
             }
         }
         for k in 0..out[0].len() / image.width {
-            let blurred = blur_columns(simd, &rows, k);
             let at = k * image.width + first;
-            for (out, blurred) in out.iter_mut().zip(&blurred) {
-                out[at..at + columns].copy_from_slice(&blurred[..columns]);
+            for (rows, out) in rows.iter().zip(&mut out) {
+                let mut blurred = [0.0; BLOCK];
+                blur_columns(simd, rows, k, &mut blurred);
+                write(simd, &blurred, &mut out[at..at + columns]);
             }
         }
     }
@@ -251,7 +275,7 @@ struct Loss<'a> {
     /// Blurred derivatives by (E[x], E[x²], E[xy]); empty without SSIM.
     derivatives: [&'a [f32]; 3],
     /// Rows with a gradient.
-    rows: std::ops::Range<usize>,
+    rows: Range<usize>,
 }
 
 impl Loss<'_> {
@@ -267,7 +291,7 @@ impl Loss<'_> {
             for (i, at) in image.rows(strip, first).enumerate().filter(|_| with_ssim) {
                 for (rows, plane) in rows.iter_mut().zip(self.derivatives) {
                     match &at {
-                        Some(at) => rows[i][..columns].copy_from_slice(&plane[at.clone()]),
+                        Some(at) => read(simd, &plane[at.clone()], &mut rows[i]),
                         None => rows[i].fill(0.0),
                     }
                 }
@@ -279,28 +303,27 @@ impl Loss<'_> {
                     gradient.fill(0.0);
                     continue;
                 }
-                if with_ssim {
-                    blurred = blur_columns(simd, &rows, k);
+                for (rows, blurred) in rows.iter().zip(&mut blurred).filter(|_| with_ssim) {
+                    blur_columns(simd, rows, k, blurred);
                 }
                 let at = row * image.width + first..row * image.width + first + columns;
-                self.differentiate(at, &blurred, gradient, &mut sums[first..first + columns]);
+                self.differentiate(simd, at, &blurred, gradient, &mut sums[first..first + columns]);
             }
         }
     }
 
     /// The gradient of pixels `at`; adds the absolute differences.
     #[inline(always)]
-    fn differentiate(
+    fn differentiate<S: Simd>(
         &self,
-        at: std::ops::Range<usize>,
+        simd: S,
+        at: Range<usize>,
         [a, b, c]: &[[f32; BLOCK]; 3],
         gradient: &mut [f32],
         sums: &mut [f32],
     ) {
-        let (mut x, mut y) = ([0.0; BLOCK], [0.0; BLOCK]);
-        let columns = gradient.len();
-        self.images.values(at.clone(), &mut x[..columns], &mut y[..columns]);
-        let mut out = [0.0; BLOCK];
+        let [mut x, mut y, mut out] = [[0.0; BLOCK]; 3];
+        self.images.values(simd, at.clone(), &mut x, &mut y);
         for k in 0..BLOCK {
             let slope = self.l1_weight * sign(x[k] - y[k]);
             out[k] = slope - self.dssim_weight * (a[k] + 2.0 * x[k] * b[k] + y[k] * c[k]);
@@ -308,8 +331,8 @@ impl Loss<'_> {
         if let Some(weights) = self.images.weights {
             out.iter_mut().zip(&weights[at]).for_each(|(out, weight)| *out *= weight);
         }
-        gradient.copy_from_slice(&out[..columns]);
-        sums.iter_mut().enumerate().for_each(|(k, sum)| *sum += (x[k] - y[k]).abs());
+        write(simd, &out, gradient);
+        sums.iter_mut().zip(x.iter().zip(&y)).for_each(|(sum, (x, y))| *sum += (x - y).abs());
     }
 }
 
