@@ -5,7 +5,7 @@ use crate::gpu::shaders::project::{COARSE_DROPPED, FINE_DROPPED, FINE_END, FINE_
 use crate::gpu::shaders::shared::cutoffs::LOG2_ALPHA_MIN;
 use crate::gpu::shaders::shared::layout::PROJECTED_FLOATS;
 use crate::gpu::shaders::structs::CameraView;
-use crate::scene::sh;
+use crate::scene::{SH_C0, sh};
 use glam::{Vec3, Vec4};
 use rayon::prelude::*;
 use std::f32::consts::LOG2_E;
@@ -40,10 +40,13 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
         if antialiased != 0 {
             log2_opacity += 0.5 * (g.squared_area() * g.conic_det).log2();
         }
-        let basis = sh::basis((mean - camera.position).normalize().as_dvec3(), degree);
-        let mut colour = Vec3::splat(0.5);
-        for (k, basis) in basis.iter().enumerate().take(((degree + 1) * (degree + 1)) as usize) {
-            colour += *basis as f32 * Vec3::from_slice(&sh[3 * (i * sh_stride + k)..]);
+        let mut colour = 0.5 + SH_C0 * Vec3::from_slice(&sh[3 * i * sh_stride..]);
+        if degree > 0 {
+            let basis = sh::basis((mean - camera.position).normalize().as_dvec3(), degree);
+            let others = basis.iter().enumerate().take(((degree + 1) * (degree + 1)) as usize).skip(1);
+            for (k, basis) in others {
+                colour += *basis as f32 * Vec3::from_slice(&sh[3 * (i * sh_stride + k)..]);
+            }
         }
         let colour = colour.max(Vec3::ZERO);
         let visible = g.visible && log2_opacity >= LOG2_ALPHA_MIN as f32;

@@ -3,7 +3,7 @@ use super::splat::{Camera, Geometry};
 use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::layout::{CAMERA_GRADIENTS, GRADIENT_FLOATS, MOMENTS};
 use crate::gpu::shaders::structs::CameraView;
-use crate::scene::sh;
+use crate::scene::{SH_C0, sh};
 use glam::{DVec3, Mat3, Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 
@@ -25,6 +25,7 @@ struct Splats<'a> {
 }
 
 /// Gradient by one splat; the SH coefficients have `basis × colour`.
+#[derive(Default)]
 struct Gradient {
     mean: Vec3,
     log_scale: Vec3,
@@ -110,6 +111,14 @@ impl Splats<'_> {
 
     /// Basis, gradient by the colour of the splat, and that by the mean through the direction.
     fn colour_backward(&self, i: usize, offset: Vec3, by_colour: Vec3) -> ([f64; 16], Vec3, Vec3) {
+        if self.degree == 0 {
+            // The colour does not depend on the direction.
+            let mut basis = [0.0; 16];
+            basis[0] = f64::from(SH_C0);
+            let colour = 0.5 + SH_C0 * Vec3::from_slice(&self.sh[3 * i * self.sh_stride..]);
+            let by_colour = Vec3::select(colour.cmplt(Vec3::ZERO), Vec3::ZERO, by_colour);
+            return (basis, by_colour, Vec3::ZERO);
+        }
         let distance = offset.length();
         let direction = offset / distance;
         let (basis, slopes) = (
@@ -243,7 +252,11 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
             let mut sum = CameraGradient::default();
             for k in 0..by_means.len() {
                 let i = part * chunk + k;
-                let g = splats.backward(i, &camera, &up[i], &mut sum);
+                // A splat beside the image has no gradient.
+                let g = match up[i].iter().all(|by| *by == 0.0) {
+                    true => Gradient::default(),
+                    false => splats.backward(i, &camera, &up[i], &mut sum),
+                };
                 by_means[k] = g.mean.to_array();
                 by_scales[k] = g.log_scale.to_array();
                 by_quats[k] = g.quat;
