@@ -1,5 +1,6 @@
 //! Tile lists by counting: `bin_count.comp`, `bin_emit.comp`, `bin_sum.comp`, `bin_scan.comp`,
 //! `bin_base.comp` and `bin_scatter.comp`.
+use super::prefetch::prefetch;
 use super::scatter::Scattered;
 use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::cutoffs::LOG2_ALPHA_MIN;
@@ -118,7 +119,11 @@ fn each_row<S: Simd>(
     grid: Grid,
     mut f: impl FnMut(usize, i32, i32, i32),
 ) {
+    let all = pairs;
     for (group, pairs) in pairs.chunks(LANES).enumerate() {
+        // The order by depth is any order of memory.
+        let later = all.iter().skip((group + 2) * LANES).take(LANES);
+        later.for_each(|pair| prefetch(&projected[pair[1] as usize]));
         let splats = std::array::from_fn(|lane| &projected[pairs[lane.min(pairs.len() - 1)][1] as usize]);
         for (lane, ellipse) in Ellipse::of(simd, splats, grid)[..pairs.len()].iter().enumerate() {
             ellipse.each_row(simd, grid.columns, |row, from, to| f(group * LANES + lane, row, from, to));

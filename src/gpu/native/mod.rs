@@ -10,6 +10,7 @@ mod bin;
 mod blend;
 mod decode;
 mod label_weights;
+mod prefetch;
 mod project;
 mod project_backward;
 mod raster;

@@ -1,5 +1,6 @@
 //! `raster_forward.comp`, `raster_backward.comp` and `count_pairs.comp`.
 use super::blend::{BASE, Blended, COLOUR, FLOATS, Splat, Sums, Upstream, blend, count, gradients};
+use super::prefetch::prefetch;
 use super::scatter::Scattered;
 use super::tile::{EDGE, Row, Tile, TileRows};
 use crate::gpu::NativeCall;
@@ -80,13 +81,25 @@ fn forward_with<const C: usize>(call: &mut NativeCall) -> Result<(), String> {
 fn blended<S: Simd, const C: usize>(simd: S, tile: &Tile, list: &[[u32; 2]], of: &[Splat<C>]) -> Blended<C> {
     let mut state = Blended { pixels: tile.pixels(), channels: [[[0.0; EDGE]; C]; EDGE] };
     let at = [tile.x as f32, tile.y as f32];
-    for [_, splat] in list {
+    for (k, [_, splat]) in list.iter().enumerate() {
+        fetch_ahead(list, k, of);
         blend(simd, &of[*splat as usize], at, &mut state);
         if state.pixels.open == 0 {
             break;
         }
     }
     state
+}
+
+/// Splats between the prefetch of one and its use.
+const AHEAD: usize = 6;
+
+/// Prefetches a splat that comes later in a list: lists name splats in any order of memory.
+#[inline(always)]
+fn fetch_ahead<const C: usize>(list: &[[u32; 2]], k: usize, of: &[Splat<C>]) {
+    if let Some([_, splat]) = list.get(k + AHEAD) {
+        prefetch(&of[*splat as usize]);
+    }
 }
 
 fn splats_of<const C: usize>(
@@ -236,7 +249,8 @@ fn differentiate<S: Simd, const C: usize>(
     gathered: &mut Gathered<C>,
 ) {
     let at = [tile.x as f32, tile.y as f32];
-    for &[_, splat] in list {
+    for (k, &[_, splat]) in list.iter().enumerate() {
+        fetch_ahead(list, k, of);
         gradients(simd, &of[splat as usize], at, coupled, state, gathered.of(splat));
         if state.pixels.open == 0 {
             break;
