@@ -142,9 +142,6 @@ impl Pixels {
             left &= left - 1;
             let dy = f32x8::simd_from(simd, dy[row]);
             let (powers, shown) = columns.powers(dy);
-            if !shown.any_true() {
-                continue;
-            }
             let cover = Cover::of(powers, shown, f32x8::simd_from(simd, self.t[row]));
             cover.t.store_array(&mut self.t[row]);
             f(row, dy, &cover);
