@@ -13,7 +13,8 @@ const COPY_STEPS: usize = shaders::bench_copy::STEPS as usize;
 const FMA_PER_THREAD: usize = (shaders::bench_fma::CHAINS * shaders::bench_fma::STEPS) as usize;
 /// Rounds of a thread in `glsl/bench_arithmetic.comp`, and operations of a round.
 const ROUNDS: u32 = 32;
-const OPERATIONS: usize = (shaders::bench_arithmetic::CHAINS * shaders::bench_arithmetic::STEPS) as usize;
+const OPERATIONS: usize =
+    (shaders::bench_arithmetic::INDEPENDENT * shaders::bench_arithmetic::PER_ROUND) as usize;
 /// Launches of a chain, each of which waits for the one before.
 const LAUNCHES: usize = 256;
 

@@ -1,7 +1,7 @@
 //! `bench_arithmetic.comp`: the limits of native code.
 use super::blend::exp2;
 use crate::gpu::NativeCall;
-use crate::gpu::shaders::bench_arithmetic::{CHAINS, STEPS, WORKGROUP};
+use crate::gpu::shaders::bench_arithmetic::{INDEPENDENT, PER_ROUND, WORKGROUP};
 use fearless_simd::{Level, Simd, dispatch, f32x8, prelude::*};
 use rayon::prelude::*;
 
@@ -28,10 +28,10 @@ fn chains<S: Simd>(simd: S, values: &mut [f32], rounds: u32, exponentials: bool)
     for values in values.chunks_exact_mut(LANES) {
         let start = f32x8::from_slice(simd, values);
         let mut sum = number(0.0);
-        for first in (0..CHAINS as usize).step_by(CHAINS_AT_ONCE) {
+        for first in (0..INDEPENDENT as usize).step_by(CHAINS_AT_ONCE) {
             let mut chain: [f32x8<S>; CHAINS_AT_ONCE] =
                 std::array::from_fn(|k| start / number((first + k + 1) as f32));
-            for _ in 0..rounds * STEPS as u32 {
+            for _ in 0..rounds * PER_ROUND as u32 {
                 for x in &mut chain {
                     *x = if exponentials { exp2(-*x) } else { x.mul_add(number(0.5), number(0.25)) };
                 }
