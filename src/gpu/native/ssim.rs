@@ -1,6 +1,6 @@
-//! `ssim_columns.comp`, `ssim_rows.comp` (or `ssim_rows_shared.comp`) and `ssim_gradient.comp`. Only these passes read their
-//! scratch buffers, which therefore hold a plane per quantity here instead of pairs: rows of a plane
-//! are vectors.
+//! `ssim_columns.comp`, `ssim_rows.comp` (or `ssim_rows_shared.comp`) and `ssim_gradient.comp`. Only
+//! these passes read their scratch buffers, which therefore hold a plane per quantity here instead
+//! of pairs: rows of a plane are vectors.
 use super::small::sign;
 use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::ssim::{C1, C2, HALF, STRIP, WINDOW};
