@@ -1,10 +1,10 @@
 #version 460
 // variants: DEPTH=0,1
 // variants: ALPHA=0,1
-// Gradients by depth and by alpha, both planes overwritten: of weight * sum over confident pixels of
-// |D - A d| / d with DEPTH, and of weight * sum of |A - a| over pixels with a wanted alpha a with
-// ALPHA. D = sum w z and A = sum w are rendered, d is the stereo depth. The first is linear in D and
-// A, so it is stable where alpha is small.
+// Gradients by depth and by alpha. Both planes are overwritten. With DEPTH the loss is weight * sum
+// of |D - A d| / d over confident pixels, with ALPHA weight * sum of |A - a| over pixels with a
+// wanted alpha a. D = sum w z and A = sum w are rendered, d is the stereo depth. The first loss is
+// linear in D and A, so it is stable where alpha is small.
 layout(local_size_x = 64) in;
 #if DEPTH
 // [H*W] depth, 0 = unknown.

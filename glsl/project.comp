@@ -31,9 +31,9 @@ layout(push_constant) uniform Push {
 #include "shared/splat.glsl"
 
 const float LOG2_E = 1.4426950408889634;
-// Depth keys have three digits of the radix sort: the bits of camera z, which grow with z, without
-// the last 4 in the octaves from 1/256 to 65536, and without the last 9 elsewhere. Depths that differ
-// by less than two millionths (60 elsewhere) keep the order of the splats.
+// Depth keys have three digits of the radix sort. They are the bits of camera z, which grow with z:
+// without the last 4 in the octaves from 1/256 to 65536, without the last 9 elsewhere. Depths that
+// differ by less than two millionths (60 elsewhere) keep the order of the splats.
 const uint DEPTH_BITS = 24;
 const uint HIDDEN_KEY = 16777215; // behind all others
 const uint FINE_FIRST = 998244352, FINE_END = 1199570944; // bits of 1/256 and 65536

@@ -1,6 +1,6 @@
 #version 460
-// Partial sums of one or two ranges of floats, always in the same order: strided over the workgroups
-// of a range, then a tree. The host adds the PARTIALS sums of a range, which begin at
+// Partial sums of one or two ranges of floats, always in the same order: strided over the
+// workgroups of a range, then a tree. The host adds the PARTIALS sums of a range, which begin at
 // result[PARTIALS * (slot + range)].
 layout(local_size_x = 256) in;
 layout(std430, binding = 0) readonly buffer Values { float values[]; };

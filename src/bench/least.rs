@@ -1,5 +1,5 @@
-//! Least time of each pass, second version (`floor v2`): bytes that must move, instruction slots and
-//! exponentials of the pairs in rows that a splat reaches, and launches that wait for each other.
+//! Least time of each pass, second version (`floor v2`): bytes that must move, instruction slots
+//! and exponentials of the pairs in rows that a splat reaches, launches that wait for each other.
 //!
 //! Floor v1 ([`super::model`]) counts an exponential as one of two operations of a fused
 //! multiply-add, a comparison as half of one, only blended pairs, and projected splats once per

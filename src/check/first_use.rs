@@ -121,22 +121,9 @@ impl Cache for PipelinesOnly {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::gpu::InMemoryCache;
     use crate::sync::lock;
-    use std::collections::BTreeMap;
     use std::sync::Mutex;
-
-    #[derive(Debug, Default)]
-    struct InMemory(Mutex<BTreeMap<String, Vec<u8>>>);
-
-    impl Cache for InMemory {
-        fn read(&self, name: &str) -> Option<Vec<u8>> {
-            lock(&self.0).get(name).cloned()
-        }
-        fn write(&self, name: &str, data: &[u8]) -> io::Result<()> {
-            lock(&self.0).insert(name.to_owned(), data.to_vec());
-            Ok(())
-        }
-    }
 
     #[derive(Debug)]
     struct ReadOnly;
@@ -179,7 +166,7 @@ mod tests {
 
     #[test]
     fn choice_is_kept_and_used() {
-        let (cache, told, begun) = (Arc::new(InMemory::default()), Told::default(), Instant::now());
+        let (cache, told, begun) = (Arc::new(InMemoryCache::default()), Told::default(), Instant::now());
         let device = chosen(cache.clone(), LIMIT, &told).unwrap();
         // A pair that has begun ends after its next runs, and devices are opened before and after.
         assert!(begun.elapsed() < LIMIT + Duration::from_secs(3), "{:?}", begun.elapsed());
@@ -196,7 +183,7 @@ mod tests {
 
     #[test]
     fn late_choice_is_kept_once() {
-        let (cache, told) = (Arc::new(InMemory::default()), Told::default());
+        let (cache, told) = (Arc::new(InMemoryCache::default()), Told::default());
         let device = chosen(cache.clone(), Duration::ZERO, &told).unwrap();
         assert_eq!(device.preferred(cache.as_ref()), Some(BTreeSet::new()));
         let lines = lock(&told.lines).clone();
@@ -213,7 +200,8 @@ mod tests {
 
     #[test]
     fn stopped_choice_is_made_again() {
-        let (cache, told) = (Arc::new(InMemory::default()), Told { is_stopped: true, ..Told::default() });
+        let (cache, told) =
+            (Arc::new(InMemoryCache::default()), Told { is_stopped: true, ..Told::default() });
         let stopped = chosen(cache.clone(), LIMIT, &told);
         assert!(matches!(stopped, Err(Error::Cancelled)));
         let device = crate::gpu::test_device();
@@ -222,7 +210,7 @@ mod tests {
 
     #[test]
     fn cpu_device_is_not_timed() {
-        let (cache, told) = (Arc::new(InMemory::default()), Told::default());
+        let (cache, told) = (Arc::new(InMemoryCache::default()), Told::default());
         let options = Options { cache: Some(cache.clone()), ..gpu::options(None) };
         let device = open(&options, &told).unwrap();
         if device.info().is_cpu {
@@ -232,7 +220,7 @@ mod tests {
 
     #[test]
     fn comparisons_ignore_kept_variants() {
-        let cache = Arc::new(InMemory::default());
+        let cache = Arc::new(InMemoryCache::default());
         let pipelines = PipelinesOnly(cache.clone());
         for name in ["a.pipelines", "a.disabled"] {
             cache.write(name, b"kept").unwrap();

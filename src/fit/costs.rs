@@ -17,8 +17,8 @@ impl Executor for Idle {
     }
 }
 
-/// Commands and barriers of the step of `splatvk bench` on a seeded scene, by pass, and the bytes of
-/// device memory of its training.
+/// Commands and barriers of the step of `splatvk bench` on a seeded scene, its commands by pass, and
+/// the bytes of device memory of its training.
 struct Step {
     counts: (usize, usize),
     passes: BTreeMap<&'static str, usize>,

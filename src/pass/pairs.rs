@@ -1,5 +1,5 @@
-//! Counts of pixel–splat pairs: evaluated by the raster shaders, blended into a pixel, and in rows of
-//! a tile with any blended pair.
+//! Counts of pixel–splat pairs: evaluated by the raster passes, blended into a pixel, and in rows
+//! of a tile with any blended pair.
 use super::rasterizer::Rasterizer;
 use super::tile_lists::TILE;
 use crate::Result;
@@ -8,7 +8,7 @@ use crate::gpu::{Device, Recorder, shaders};
 /// Pixel–splat pairs of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pairs {
-    /// Evaluated by the raster shaders.
+    /// Evaluated by the raster passes: shaders, or native code where it takes their place.
     pub evaluated: f64,
     /// Blended into a pixel.
     pub blended: f64,

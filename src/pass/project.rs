@@ -33,8 +33,8 @@ pub fn depth_key(z: f32) -> u32 {
 }
 
 /// Records the projection of all splats to `frame.projected`, with the
-/// first (sh_degree + 1)² SH coefficients, and of their depth keys for `sort`. Writes their number to
-/// `splat_count` and clears the counters of `sort` and of the tile lists.
+/// first (sh_degree + 1)² SH coefficients, and of their depth keys for `sort`. Writes their number
+/// to `splat_count` and clears the counters of `sort` and of the tile lists.
 pub(super) fn record(
     rec: &mut Recorder,
     splats: &SplatBuffers,

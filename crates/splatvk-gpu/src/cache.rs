@@ -113,23 +113,8 @@ impl Driver {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::sync::lock;
-    use crate::{Device, Options, Recorder};
-    use std::collections::BTreeMap;
-    use std::sync::{Arc, Mutex};
-
-    #[derive(Debug, Default)]
-    struct InMemory(Mutex<BTreeMap<String, Vec<u8>>>);
-
-    impl Cache for InMemory {
-        fn read(&self, name: &str) -> Option<Vec<u8>> {
-            lock(&self.0).get(name).cloned()
-        }
-        fn write(&self, name: &str, data: &[u8]) -> io::Result<()> {
-            lock(&self.0).insert(name.to_owned(), data.to_vec());
-            Ok(())
-        }
-    }
+    use crate::{Device, InMemoryCache, Options, Recorder};
+    use std::sync::Arc;
 
     fn driver(driver_version: u32) -> Driver {
         Driver::new(&vk::PhysicalDeviceProperties {
@@ -143,9 +128,9 @@ mod tests {
 
     #[test]
     fn pipelines_return_to_their_driver_only() {
-        let (cache, own, newer) = (InMemory::default(), driver(1), driver(2));
+        let (cache, own, newer) = (InMemoryCache::default(), driver(1), driver(2));
         own.keep_pipelines(&cache, &own.header);
-        assert!(lock(&cache.0).is_empty(), "a header alone is not kept");
+        assert!(cache.is_empty(), "a header alone is not kept");
         let data = [own.header.as_slice(), b"compiled"].concat();
         own.keep_pipelines(&cache, &data);
         assert_eq!(own.pipelines(&cache), data);
@@ -159,7 +144,7 @@ mod tests {
 
     #[test]
     fn disabled_variants_stay_disabled_for_this_driver() {
-        let (cache, own, newer) = (InMemory::default(), driver(1), driver(2));
+        let (cache, own, newer) = (InMemoryCache::default(), driver(1), driver(2));
         let names = BTreeSet::from(["a".to_owned(), "b c".to_owned()]);
         own.disable(&cache, &names).unwrap();
         assert_eq!(own.disabled(&cache), names);
@@ -170,7 +155,7 @@ mod tests {
 
     #[test]
     fn preferred_variants_return_to_their_driver_only() {
-        let (cache, own, newer) = (InMemory::default(), driver(1), driver(2));
+        let (cache, own, newer) = (InMemoryCache::default(), driver(1), driver(2));
         assert_eq!(own.preferred(&cache), None);
         let names = BTreeSet::from(["a".to_owned(), "b c".to_owned()]);
         for names in [&names, &BTreeSet::new()] {
@@ -189,7 +174,7 @@ mod tests {
 
     #[test]
     fn opened_device_carries_preferred_variants() {
-        let cache = Arc::new(InMemory::default());
+        let cache = Arc::new(InMemoryCache::default());
         let options = Options { cache: Some(cache.clone()), ..Options::default() };
         let names = BTreeSet::from(["a".to_owned()]);
         let device = Device::open(&options).unwrap();
@@ -204,7 +189,7 @@ mod tests {
 
     #[test]
     fn a_device_opens_whatever_its_cache_holds() {
-        let cache = Arc::new(InMemory::default());
+        let cache = Arc::new(InMemoryCache::default());
         let options = Options { validation: true, cache: Some(cache.clone()), ..Options::default() };
         let work = || {
             let device = Device::open(&options).unwrap();

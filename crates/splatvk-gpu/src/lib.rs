@@ -121,7 +121,7 @@ pub use program::Program;
 pub use recorder::Recorder;
 pub use survey::{Survey, Surveyed, survey};
 #[cfg(feature = "testing")]
-pub use testing::TestDevice;
+pub use testing::{InMemoryCache, TestDevice};
 
 #[cfg(test)]
 mod tests;

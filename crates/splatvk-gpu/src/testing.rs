@@ -1,10 +1,14 @@
-//! Devices for tests, with validation on.
+//! Devices for tests, with validation on, and a cache for them.
 use crate::Result;
+use crate::cache::Cache;
 use crate::device::Device;
 use crate::executor::Executor;
 use crate::info::Options;
+use crate::sync::lock;
+use std::collections::BTreeMap;
+use std::io;
 use std::ops::Deref;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 
 /// A device with validation on. Dropping it fails the test if the layer has reported anything.
 pub struct TestDevice(Device);
@@ -74,5 +78,27 @@ impl Drop for TestDevice {
         if !std::thread::panicking() {
             self.0.assert_no_validation_messages();
         }
+    }
+}
+
+/// A cache that ends with the test.
+#[derive(Debug, Default)]
+pub struct InMemoryCache(Mutex<BTreeMap<String, Vec<u8>>>);
+
+impl InMemoryCache {
+    /// Whether nothing was written.
+    pub fn is_empty(&self) -> bool {
+        lock(&self.0).is_empty()
+    }
+}
+
+impl Cache for InMemoryCache {
+    fn read(&self, name: &str) -> Option<Vec<u8>> {
+        lock(&self.0).get(name).cloned()
+    }
+
+    fn write(&self, name: &str, data: &[u8]) -> io::Result<()> {
+        lock(&self.0).insert(name.to_owned(), data.to_vec());
+        Ok(())
     }
 }

@@ -6,7 +6,7 @@ use std::collections::{HashMap, VecDeque};
 /// label: behind the silhouette of a thing, a few triangles in the air have its label.
 const CRUMB: f64 = 0.02;
 /// Half the width of the widest strip of a label that joins the label beside it, in triangles,
-/// about two per voxel. At the silhouette of a thing, the depth in such a strip is that of no thing.
+/// about two per voxel. At the silhouette of a thing, the depth in such a strip is that of none.
 const SHRED: u32 = 6;
 /// Share of the area of a label that its strips must leave; a label with less is thin everywhere,
 /// as a spoon is, and keeps them.

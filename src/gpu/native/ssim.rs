@@ -1,6 +1,6 @@
-//! `ssim_columns.comp`, `ssim_rows.comp` (or `ssim_rows_shared.comp`) and `ssim_gradient.comp`. Only
-//! these passes read their scratch buffers, which therefore hold a plane per quantity here instead
-//! of pairs: rows of a plane are vectors.
+//! `ssim_columns.comp`, `ssim_rows.comp` (or `ssim_rows_shared.comp`) and `ssim_gradient.comp`.
+//! Only these passes read their scratch buffers. Here these hold a plane per quantity instead of
+//! pairs, so that rows of a plane are vectors.
 use super::small::sign;
 use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::ssim::{C1, C2, HALF, STRIP, WINDOW};
@@ -214,7 +214,7 @@ impl RowScratch {
         RowScratch { wide: planes(stride + TAPS - 1), blurred: planes(stride) }
     }
 
-    /// Leaves the blurred derivatives in the first three planes of `blurred`, and SSIM in `wide[3]`.
+    /// Leaves the blurred derivatives in the first planes of `blurred`, and SSIM in `wide[3]`.
     #[inline(always)]
     fn compute<S: Simd>(&mut self, simd: S, width: usize) {
         for (wide, blurred) in self.wide.iter().zip(&mut self.blurred) {
