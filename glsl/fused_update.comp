@@ -18,12 +18,12 @@ layout(std430, binding = 3) buffer Quats { vec4 quats[]; };  // [N]
 layout(std430, binding = 4) buffer OpacityLogits { vec4 opacity_logits[]; };  // [N]
 layout(std430, binding = 5) buffer Sh { vec4 sh[]; };  // [N, SH_COUNT, 3]
 layout(std430, binding = 6) readonly buffer ProjectedGrad { vec4 projected_grad[]; };  // [N, 3]
-// (m, v) per parameter, two parameters a vector.
-layout(std430, binding = 7) buffer MeansMoments { vec4 means_moments[]; };
-layout(std430, binding = 8) buffer LogScalesMoments { vec4 log_scales_moments[]; };
-layout(std430, binding = 9) buffer QuatsMoments { vec4 quats_moments[]; };
-layout(std430, binding = 10) buffer OpacityLogitsMoments { vec4 opacity_logits_moments[]; };
-layout(std430, binding = 11) buffer ShMoments { vec4 sh_moments[]; };
+// A word per parameter.
+layout(std430, binding = 7) buffer MeansMoments { uvec4 means_moments[]; };
+layout(std430, binding = 8) buffer LogScalesMoments { uvec4 log_scales_moments[]; };
+layout(std430, binding = 9) buffer QuatsMoments { uvec4 quats_moments[]; };
+layout(std430, binding = 10) buffer OpacityLogitsMoments { uvec4 opacity_logits_moments[]; };
+layout(std430, binding = 11) buffer ShMoments { uvec4 sh_moments[]; };
 // [CAMERA_GRADIENTS, workgroups].
 layout(std430, binding = 12) writeonly buffer CameraParts { float camera_parts[]; };
 layout(std430, binding = 13) buffer Faults { uint faults[]; };
@@ -40,7 +40,7 @@ layout(push_constant) uniform Push { uint count; uint antialiased; float weight;
 #include "shared/sh.glsl"
 #include "shared/splat.glsl"
 
-// Rows of the rates.
+// Rows of the rates after the first.
 const uint MEANS_ROW = 0, LOG_SCALES_ROW = 1, QUATS_ROW = 2, OPACITY_LOGITS_ROW = 3, SH_ROW = 4;
 
 vec3 mean_of(uint i) {
@@ -94,20 +94,21 @@ void keep(uint thread, SplatGradient g) {
 const uint SH_BATCH = SH_DEGREE == 0 ? 1 : 3;
 
 // Moves the WIDTH numbers of each of `splats` splats from `first` on, four per thread. GRADIENT and
-// RATE are expressions of `splat`, the word of its gradient, `column` and `row`. A last vector of
-// one or two numbers has one vector of moments.
+// RATE are expressions of `splat`, the word of its gradient, `column` and `row`.
 #define MOVE(parameters, moments, WIDTH, BATCH, ROW_OF_RATES, GRADIENT, RATE) { \
     uint end = splats * (WIDTH), base = first / 4 * (WIDTH); \
-    vec4 row = rates[ROW_OF_RATES]; \
+    vec4 row = rates[1 + (ROW_OF_RATES)]; \
+    uint seed = rounding_seed(rates[0].x, ROW_OF_RATES); \
     for (uint begin = thread; 4 * begin < end; begin += (BATCH) * GROUP) { \
-        vec4 parameter[BATCH], pair[BATCH][2]; \
+        vec4 parameter[BATCH]; \
+        uvec4 four[BATCH]; \
         [[unroll]] for (uint b = 0; b < (BATCH); b++) { \
             uint v = begin + b * GROUP; \
-            parameter[b] = pair[b][0] = pair[b][1] = vec4(0.0); \
+            parameter[b] = vec4(0.0); \
+            four[b] = uvec4(0); \
             if (4 * v < end) { \
                 parameter[b] = parameters[base + v]; \
-                pair[b][0] = moments[2 * (base + v)]; \
-                if ((WIDTH) % 4 == 0 || 4 * v + 2 < end) pair[b][1] = moments[2 * (base + v) + 1]; \
+                four[b] = moments[base + v]; \
             } \
         } \
         [[unroll]] for (uint b = 0; b < (BATCH); b++) { \
@@ -121,14 +122,14 @@ const uint SH_BATCH = SH_DEGREE == 0 ? 1 : 3;
                     gradient[c] = GRADIENT; \
                     rate[c] = RATE; \
                 } \
-                bvec4 finite = adam(parameter[b], pair[b], gradient, rate, row.z, row.w); \
+                uvec4 noise = rounding_noise(4 * (base + v) + uvec4(0, 1, 2, 3), seed); \
+                bvec4 finite = adam(parameter[b], four[b], gradient, rate, row.z, row.w, noise); \
                 if (!all(finite)) { \
                     uvec4 bad = uvec4(not(finite)); \
                     atomicAdd(faults[0], bad.x + bad.y + bad.z + bad.w); \
                 } \
                 parameters[base + v] = parameter[b]; \
-                moments[2 * (base + v)] = pair[b][0]; \
-                if ((WIDTH) % 4 == 0 || 4 * v + 2 < end) moments[2 * (base + v) + 1] = pair[b][1]; \
+                moments[base + v] = four[b]; \
             } \
         } \
     } \

@@ -126,7 +126,7 @@ impl PassWork {
             // Gradients need not leave the pass: those of two passes are not counted.
             "projection backward" => work(n * (4.0 * parameters + GRADIENT), gradients.0, gradients.1, 1.0),
             fused_update::PASS => work(
-                n * (24.0 * parameters + GRADIENT),
+                n * (16.0 * parameters + GRADIENT),
                 gradients.0 + update,
                 gradients.1 + 2.0 * n * parameters,
                 1.0,
@@ -135,7 +135,7 @@ impl PassWork {
             "Adam" => {
                 // With the fused update only the features have a pass of their own.
                 let numbers = n * (if fused { 0.0 } else { parameters } + d);
-                work(20.0 * numbers + 4.0 * n * d, ADAM * numbers, 2.0 * numbers, 1.0)
+                work(12.0 * numbers + 4.0 * n * d, ADAM * numbers, 2.0 * numbers, 1.0)
             }
             _ => None,
         }

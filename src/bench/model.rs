@@ -88,16 +88,16 @@ impl PassWork {
             "projection backward" => (n * (2.0 * (GEOMETRY + colour) + PROJECTED), n * (600.0 + 12.0 * sh)),
             "feature backward" => (12.0 * n * d, 6.0 * n * d),
             // Both passes without the gradients, which they write and read, and with one reading of
-            // the parameters instead of two: 2 · 4 + 28 − 4 − 4 − 4 bytes per parameter.
+            // the parameters instead of two: 2 · 4 + 20 − 4 − 4 − 4 bytes per parameter.
             fused_update::PASS => {
                 let parameters = n * (11.0 + 3.0 * sh);
-                (24.0 * parameters + n * PROJECTED, n * (610.0 + 12.0 * sh) + 12.0 * parameters)
+                (16.0 * parameters + n * PROJECTED, n * (610.0 + 12.0 * sh) + 12.0 * parameters)
             }
             "Adam" => {
                 // With the fused update only the features have a pass of their own.
                 let parameters = n * (if fused { 0.0 } else { 11.0 + 3.0 * sh } + d);
-                // Parameter and two moments read and written, gradient read.
-                (28.0 * parameters, 12.0 * parameters)
+                // Parameter and moments read and written, gradient read.
+                (20.0 * parameters, 12.0 * parameters)
             }
             _ => return None,
         })

@@ -128,14 +128,20 @@ fn adam(device: &Device) -> Found {
     let guard = device.buffer::<u32>("guard", 2)?;
     let moments = Moments::new(device, count)?;
     let mut schedule = Schedule::new(device, 2)?;
-    let mut expected: Vec<f64> = start.iter().map(|&v| v.into()).collect();
-    let mut state = vec![[0.0; 2]; count];
     const STEPS: usize = 3;
+    // A step of 1e-2 of numbers around 1, rounded to f32.
+    let moved =
+        Tolerance { relative_l2: 1e-6, absolute: 1e-6, relative: 1e-6, outliers: 0.0, outlier_factor: 1.0 };
+    let rounded = Tolerance { relative_l2: 1e-2, absolute: 1e-30, relative: 2f64.powi(-7), ..moved };
+    let mut distances = Vec::new();
     for step in 1..=STEPS {
         let mut g: Vec<f32> = (0..count).map(|_| random.normal() as f32).collect();
         g[5] = f32::NAN;
         gradients.write(&g)?;
         schedule.set(step, &[[0.0; 2], rates])?;
+        let mut expected: Vec<f64> = parameters.read()?.into_iter().map(f64::from).collect();
+        let mut state: Vec<[f64; 2]> =
+            moments.read(count)?.into_iter().map(|pair| pair.map(f64::from)).collect();
         let mut rec = Recorder::new(device, "self-check of Adam");
         let class = Class { slot: 1, count, stride: stride as u32, head: head as u32 };
         schedule.record(&mut rec, class, &parameters, &gradients, &moments, &guard);
@@ -145,10 +151,9 @@ fn adam(device: &Device) -> Found {
             let (p, mv) = (&mut expected[one.clone()], &mut state[one]);
             adam::adam(p, &[f64::from(*g)], mv, rate, adam::EPSILON, step);
         }
+        distances.push(close("parameters", &parameters.read()?, &expected, &moved));
+        distances.push(close("moments", moments.read(count)?.as_flattened(), state.as_flattened(), &rounded));
     }
-    // Three steps of 1e-2 on numbers around 1, rounded to f32.
-    let tolerance =
-        Tolerance { relative_l2: 1e-6, absolute: 2e-6, relative: 1e-6, outliers: 0.0, outlier_factor: 1.0 };
     let faults = equal("gradients that are not finite", &[schedule.faults()?], &[STEPS as u32]);
-    Ok(faults.and(worst([close("parameters", &parameters.read()?, &expected, &tolerance)])))
+    Ok(faults.and(worst(distances)))
 }

@@ -3,9 +3,9 @@ use super::compared::{Found, close, equal, worst};
 use super::{Case, case};
 use crate::gpu::{Device, KernelVariant, Recorder};
 use crate::math::Random;
-use crate::pass::adam::{BETA, EPSILON, Moments, Schedule, adam};
 use crate::pass::close::{IMAGE, Tolerance, gradient_tolerance};
-use crate::pass::fused_update::{self, ROWS, SplatAdam, flat};
+use crate::pass::first_step::FirstStep;
+use crate::pass::fused_update;
 use crate::pass::label_weights::{self, LabelWeights};
 use crate::pass::params::Params;
 use crate::pass::raster_forward::{Cutoffs, ReferenceScene};
@@ -43,12 +43,6 @@ pub(super) const CASES: &[Case] = &[
 const SIZE: [u32; 2] = [75, 53];
 const FEATURES: usize = 6;
 const MODE: FeatureMode = FeatureMode::Gauge { epsilon: 1e-3, blocks: 2 };
-
-/// Place of the SH coefficients in [`flat`].
-const SH: usize = ROWS[4] as usize;
-/// One step of Adam on numbers around 1, rounded to f32.
-const STEPPED: Tolerance =
-    Tolerance { relative_l2: 1e-6, absolute: 2e-6, relative: 1e-6, outliers: 0.0, outlier_factor: 1.0 };
 
 struct Scene {
     dim: usize,
@@ -212,59 +206,20 @@ fn update(device: &Device) -> Found {
     let values = (5 + FEATURES) * (SIZE[0] * SIZE[1]) as usize;
     let upstream: Vec<f32> = (0..values).map(|_| random.scaled_normal(1.0) as f32).collect();
     raster.frame().planes_grad.write(&upstream)?;
-    let mut moved = scene.params();
-    let start = flat(&moved);
-    let [a, b, c, d, e] = start.each_ref().map(|v| Moments::new(device, v.len()));
-    let moments = [a?, b?, c?, d?, e?];
-    let mut schedule = Schedule::new(device, ROWS.len())?;
-    let rates = [[1e-3, 1e-3], [2e-3, 2e-3], [3e-3, 3e-3], [4e-3, 4e-3], [5e-3, 6e-3]];
-    schedule.set(1, &rates)?;
+    let upstream: Vec<f64> = upstream.iter().map(|&g| g.into()).collect();
+    let (start, forward) = (scene.params(), scene.reference());
+    let reference = reference::backward(&start, &scene.view, MODE, &Cutoffs::STANDARD, &forward, &upstream);
     let needles = Some(RatioPenalty { weight: 0.25, limit: 2.0 });
+    let first = FirstStep::new(device, &start, reference.params, needles)?;
     let mut rec = Recorder::new(device, "self-check of the update");
     raster.record_band_backward(&mut rec, &params, &scene.options, &raster.frame().bands.get(0));
-    let state = SplatAdam { moments: &moments, schedule: &schedule, needles };
-    raster.record_update(&mut rec, &params, &scene.options, &state);
+    raster.record_update(&mut rec, &params, &scene.options, &first.state());
     rec.run()?;
 
-    let upstream: Vec<f64> = upstream.iter().map(|&g| g.into()).collect();
-    let (params_f64, forward) = (scene.params(), scene.reference());
-    let reference =
-        reference::backward(&params_f64, &scene.view, MODE, &Cutoffs::STANDARD, &forward, &upstream);
-    let mut gradients = reference.params;
-    let mut state = start.each_ref().map(|v| vec![[0.0; 2]; v.len()]);
-    fused_update::reference(&mut moved, &mut gradients, &mut state, &rates, needles, 1);
-    let found = flat(&Params::new(&params.download()?.0, &[], 0));
-    let names = ["means", "log scales", "quaternions", "opacity logits", "SH"];
-    let mut distances = Vec::new();
-    for (class, gradients) in flat(&gradients).iter().enumerate() {
-        let now = moments[class].buffer.read_range(0..2 * gradients.len())?;
-        // The first m is a tenth of the gradient. The first step has the length of the rate, so its
-        // sign is that of the gradient on the device, which may be rounding alone.
-        let first: Vec<f32> = now.iter().step_by(2).map(|m| m / (1.0 - BETA[0]) as f32).collect();
-        distances.push(close(names[class], &first, gradients, &gradient_tolerance(gradients)));
-        let width = if class == SH { 3 * scene.splats.sh_len() } else { 1 };
-        let expected: Vec<f64> = first
-            .iter()
-            .enumerate()
-            .map(|(i, g)| {
-                let (mut p, mut mv) = ([start[class][i]], [[0.0; 2]]);
-                adam(
-                    &mut p,
-                    &[f64::from(*g)],
-                    &mut mv,
-                    rates[class][usize::from(i % width >= 3)],
-                    EPSILON,
-                    1,
-                );
-                p[0]
-            })
-            .collect();
-        let found: Vec<f32> = found[class].iter().map(|v| *v as f32).collect();
-        distances.push(close(names[class], &found, &expected, &STEPPED));
-    }
+    let update = first.compare(&Params::new(&params.download()?.0, &[], 0))?;
     let camera = raster.frame().camera_grad.read()?;
-    distances.push(close("pose", &camera[..6], &reference.twist, &gradient_tolerance(&reference.twist)));
-    Ok(worst(distances))
+    let pose = close("pose", &camera[..6], &reference.twist, &gradient_tolerance(&reference.twist));
+    Ok(worst([update, pose]))
 }
 
 fn regularisers(device: &Device) -> Found {

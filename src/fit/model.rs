@@ -61,7 +61,7 @@ pub(super) struct State {
     features: Vec<f32>,
     feature_dim: usize,
     /// Moments per class, then of the features.
-    moments: Vec<Vec<f32>>,
+    moments: Vec<Vec<u32>>,
     step: usize,
     unseen: Vec<f32>,
 }
@@ -241,9 +241,9 @@ impl Model {
             *buffer_mut(&mut values, kind) =
                 compact::gather(device, "kept splats", buffer(&self.values, kind), &index, n, w)?;
             let moments = &mut self.moments[kind as usize];
-            moments.buffer = compact::gather(device, "adam moments", &moments.buffer, &index, n, 2 * w)?;
+            moments.buffer = compact::gather(device, "adam moments", &moments.buffer, &index, n, w)?;
             if !added.is_empty() {
-                moments.buffer.write_at(2 * w * kept.len(), &vec![0.0; 2 * w * added.len()])?;
+                moments.buffer.write_at(w * kept.len(), &vec![0; w * added.len()])?;
             }
         }
         self.feature_moments = Moments::new(device, n * dim)?;

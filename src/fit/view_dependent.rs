@@ -84,10 +84,11 @@ pub fn fit_view_dependent(
     Ok(result)
 }
 
-/// Highest degree whose coefficients the device binds; their two moments are the largest buffer.
+/// Highest degree whose coefficients the device binds: they and their moments are the largest
+/// buffers.
 /// `range` is the largest binding, bytes.
 fn highest(range: u64, splats: usize) -> u32 {
-    let bytes = |degree: u32| (2 * 4 * 3 * sh_coefficients(degree) * splats) as u64;
+    let bytes = |degree: u32| (4 * 3 * sh_coefficients(degree) * splats) as u64;
     (0..=HIGHEST).rev().find(|d| bytes(*d) <= range).unwrap_or(0)
 }
 
@@ -151,9 +152,9 @@ mod tests {
 
     #[test]
     fn highest_degree_falls_with_splats() {
-        // The two moments of a splat of degree 3 take 2 · 4 · 3 · 16 = 384 bytes.
+        // The coefficients of a splat of degree 3 take 4 · 3 · 16 = 192 bytes.
         let range = 128 << 20;
-        let degrees = [100_000, 349_525, 349_526, 621_378, 621_379, 1_398_101, 5_000_000];
+        let degrees = [100_000, 699_050, 699_051, 1_242_756, 1_242_757, 2_796_202, 10_000_000];
         assert_eq!(degrees.map(|splats| highest(range, splats)), [3, 3, 2, 2, 1, 1, 0]);
     }
 }

@@ -2,16 +2,15 @@
 //! workgroup, and their buffers are not needed.
 //!
 //! Equations and references: [`super::project_backward`], [`super::regularise::ratio_penalty`],
-//! [`super::adam`].
-use super::adam::{self, Moments, Schedule};
+//! [`super::adam`]; [`super::first_step`] compares them.
+use super::adam::{Moments, Schedule};
 use super::frame::FrameBuffers;
 use super::params::Params;
 use super::project_backward::{groups, record_camera};
-use super::regularise::{RatioPenalty, ratio_penalty};
+use super::regularise::RatioPenalty;
 use super::splat_buffers::SplatBuffers;
 use crate::gpu::shaders::structs::CameraView;
 use crate::gpu::{Buffer, DeviceInfo, KernelVariant, Recorder, VariantPair, shaders};
-use crate::scene::sh_coefficients;
 
 /// Rows of the [`Schedule`], and places in the array of moments, of the parameter classes: means,
 /// log scales, quaternions, opacity logits, SH.
@@ -105,40 +104,6 @@ pub(super) fn record(
     record_camera(rec, frame, groups);
 }
 
-/// CPU reference: adds the gradient of the penalty on needles to `gradients` and moves `params`
-/// with their moments (m, v), classes in the order of [`ROWS`]. `rates` are (head, tail) per class.
-pub fn reference(
-    params: &mut Params,
-    gradients: &mut Params,
-    moments: &mut [Vec<[f64; 2]>; 5],
-    rates: &[[f64; 2]; 5],
-    needles: Option<RatioPenalty>,
-    step: usize,
-) {
-    if let Some(RatioPenalty { weight, limit }) = needles {
-        for (s, g) in params.log_scales.iter().zip(&mut gradients.log_scales) {
-            *g += glam::DVec3::from(ratio_penalty(s.to_array(), weight, limit.into()).1);
-        }
-    }
-    let mut values = flat(params);
-    let sh_width = 3 * sh_coefficients(params.sh_degree);
-    for (class, (values, gradients)) in values.iter_mut().zip(flat(gradients)).enumerate() {
-        for i in 0..values.len() {
-            let tail = ROWS[class] == shaders::fused_update::SH_ROW && i % sh_width >= 3;
-            let (rate, at) = (rates[class][usize::from(tail)], i..i + 1);
-            let (value, gradient) = (&mut values[at.clone()], &gradients[at.clone()]);
-            adam::adam(value, gradient, &mut moments[class][at], rate, adam::EPSILON, step);
-        }
-    }
-    let [means, log_scales, quats, opacity_logits, sh] = values;
-    let triples = |v: Vec<f64>| v.chunks_exact(3).map(glam::DVec3::from_slice).collect();
-    params.means = triples(means);
-    params.log_scales = triples(log_scales);
-    params.quats = quats.chunks_exact(4).map(glam::DVec4::from_slice).collect();
-    params.opacity_logits = opacity_logits;
-    params.sh = triples(sh);
-}
-
 /// The numbers of each class, in the order of [`ROWS`].
 pub fn flat(params: &Params) -> [Vec<f64>; 5] {
     let flat = |v: &[glam::DVec3]| v.iter().flat_map(glam::DVec3::to_array).collect();
@@ -206,8 +171,8 @@ mod tests {
         rec.run().unwrap();
     }
 
-    fn moments(step: &Step) -> Vec<Vec<f32>> {
-        step.moments.iter().map(|m| m.buffer.read().unwrap()).collect()
+    fn moments(step: &Step) -> Vec<[f32; 2]> {
+        step.moments.iter().zip(WIDTHS).flat_map(|(m, width)| m.read(150 * width).unwrap()).collect()
     }
 
     #[test]
@@ -217,7 +182,7 @@ mod tests {
         step.raster.frame().status.write(&[0, 1, 0]).unwrap();
         update(&step);
         assert!(before == step.params.download().unwrap() && step.schedule.faults().unwrap() == 0);
-        assert!(moments(&step).iter().flatten().all(|m| *m == 0.0));
+        assert!(moments(&step).iter().all(|m| *m == [0.0; 2]));
     }
 
     #[test]
@@ -244,8 +209,9 @@ mod tests {
         rec.run().unwrap();
         let faults = schedule.faults().unwrap();
         assert!(faults > 0 && faults == fused.schedule.faults().unwrap(), "{faults}");
-        for (a, b) in moments(&separate).iter().flatten().zip(moments(&fused).iter().flatten()) {
-            assert!((a - b).abs() <= 1e-4 * a.abs() + 1e-12, "{a} {b}");
+        for (a, b) in moments(&separate).as_flattened().iter().zip(moments(&fused).as_flattened()) {
+            // Twice the rounding of m.
+            assert!((a - b).abs() <= a.abs() / 64.0 + 1e-12, "{a} {b}");
         }
         let splats = fused.params.download().unwrap().0;
         assert!(splats.means.as_flattened().iter().chain(&splats.sh).all(|v| v.is_finite()));

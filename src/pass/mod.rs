@@ -8,6 +8,7 @@ pub mod close;
 pub mod codes;
 pub mod compact;
 pub mod decode;
+pub mod first_step;
 pub mod frame;
 pub mod fused_update;
 pub mod label_weights;

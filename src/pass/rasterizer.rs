@@ -155,7 +155,7 @@ impl Rasterizer {
         // About five entries per splat on the seeded scene; `forward` grows lists that are too
         // short.
         let most = most_entries(device, (choices.grouping, splats, tiles), choices.summation, feature_dim);
-        let entries = (8 * splats + 4 * tiles).min(most);
+        let entries = (6 * splats + 4 * tiles).min(most);
         let frame = FrameBuffers {
             width,
             height,

@@ -143,14 +143,14 @@ fn training_bytes(
     // Planes and their gradients; transmittance, loss; SSIM: three vec2 and one float per colour.
     let mut bytes = stored * (4 * (2 * channels as u64 + 1) + 8 + 84);
     // Projected splats: 12 + 12 floats, the features and their gradients, depth keys and their
-    // sort; eight entries of 20 bytes in the lists.
-    bytes += splats * (96 + 8 * features as u64 + 16 + 160);
+    // sort; six entries of 20 bytes in the lists.
+    bytes += splats * (96 + 8 * features as u64 + 16 + 120);
     // Photo, wanted alpha; depth, or a label per level.
     bytes += sizes.iter().map(pixels).sum::<u64>() * (16 + if features > 0 { 12 } else { 4 });
-    // Value, gradient and two moments of each parameter, at SH degree 0; the fused update stores no
+    // Value, gradient and moments of each parameter, at SH degree 0; the fused update stores no
     // gradients but those of the features.
-    let geometry = if UpdateKernel::of(device) == UpdateKernel::Fused { 12 * 14 } else { 16 * 14 };
-    Ok(bytes + splats * (geometry + 16 * features as u64))
+    let geometry = if UpdateKernel::of(device) == UpdateKernel::Fused { 8 * 14 } else { 12 * 14 };
+    Ok(bytes + splats * (geometry + 12 * features as u64))
 }
 
 /// Reason why photos of these sizes do not fit, or `None`.
@@ -250,10 +250,10 @@ pub fn check(
     }))
 }
 
-/// Maximum number of splats that the device binds with this many features. The two moments of the
-/// features are the widest row.
+/// Maximum number of splats that the device binds with this many features, the widest row but for
+/// lists of six entries with gradients.
 pub fn most_splats(device: &DeviceInfo, features: usize) -> usize {
-    let row_bytes = (8 * features).max(96);
+    let row_bytes = (4 * features).max(96);
     (device.max_storage_range / row_bytes as u64) as usize
 }
 

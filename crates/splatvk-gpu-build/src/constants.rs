@@ -112,7 +112,11 @@ fn outside_brackets(text: &str) -> Vec<&str> {
 /// A literal and the type that GLSL gives it.
 fn number(text: &str) -> Option<(f64, Kind)> {
     if let Some(digits) = text.strip_suffix('u') {
-        return digits.parse::<u32>().ok().map(|v| (f64::from(v), Kind::Uint));
+        let value = match digits.strip_prefix("0x") {
+            Some(hex) => u32::from_str_radix(hex, 16),
+            None => digits.parse::<u32>(),
+        };
+        return value.ok().map(|v| (f64::from(v), Kind::Uint));
     }
     if let Ok(whole) = text.parse::<i32>() {
         return Some((f64::from(whole), Kind::Int));

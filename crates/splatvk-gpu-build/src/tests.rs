@@ -76,15 +76,19 @@ fn variants_subgroups_and_atomics_multiply() {
 
 #[test]
 fn constants_cross_to_rust() {
-    let header = "const uint SIDE = 4;\nconst float SCALE = 0.1;\n#define PIXELS 16\n";
+    let header = "const uint SIDE = 4, MASK = 0xffff0000u;\nconst float SCALE = 0.1;\n#define PIXELS 16\n";
     let text = shader(
         "#include \"shared/tile.glsl\"\n\
          layout(binding = 0) buffer To { float to[]; };\n\
          void main() { to[SIDE] = SCALE; }",
     );
     let code = bindings(&[("one.comp", &text), ("shared/tile.glsl", header)]).unwrap();
-    for expected in ["pub const SIDE: u32 = 4;", "pub const SCALE: f64 = 0.1;", "pub const PIXELS: i32 = 16;"]
-    {
+    for expected in [
+        "pub const SIDE: u32 = 4;",
+        "pub const MASK: u32 = 4294901760;",
+        "pub const SCALE: f64 = 0.1;",
+        "pub const PIXELS: i32 = 16;",
+    ] {
         assert!(code.contains(expected), "{expected}: {code}");
     }
 }

@@ -55,11 +55,13 @@ fn adam_matches_shader() {
         let class = Class { slot: 1, count, stride, head };
         schedule.record(&mut rec, class, &parameters, &by, &moments, &guard);
         rec.run().unwrap();
-        (parameters.read().unwrap(), moments.buffer.read().unwrap(), schedule.faults().unwrap())
+        (parameters.read().unwrap(), moments.read(count).unwrap(), schedule.faults().unwrap())
     };
     let [shader, native] = devices().map(|device| run(&device));
     assert_close("parameters", &shader.0, &native.0, 1e-5);
-    assert_close("moments", &shader.1, &native.1, 1e-5);
+    // Both add the same noise before they cut bits off: few numbers round differently.
+    let pairs = shader.1.iter().zip(&native.1);
+    assert!(pairs.filter(|(a, b)| a != b).count() < count / 100);
     assert_eq!((shader.2, native.2), (6, 6));
 }
 

@@ -113,9 +113,9 @@ struct Encoder {
 const PASSING: &[&str] = &["language"];
 
 /// Bytes of `channels` features of `splats` splats in training on views of `pixels` pixels: value,
-/// raw value, gradient and two moments each, and an image with its gradient per channel.
+/// raw value, gradient and moments each, and an image with its gradient per channel.
 pub fn feature_bytes(splats: usize, channels: usize, pixels: usize) -> u64 {
-    4 * channels as u64 * (5 * splats as u64 + 2 * pixels as u64)
+    4 * channels as u64 * (4 * splats as u64 + 2 * pixels as u64)
 }
 
 /// Pixels of the largest photo.
