@@ -108,6 +108,7 @@ fn measure(
     let (budget, roofline) = limits;
     // Grows the tile lists to the size of the scene before the first recording.
     run.step(ITERATION)?;
+    run.finish_step()?;
     let sums = section.passes(device, &|| run.record(0), budget)?;
     let processor = section.rows.iter().map(|r| r.ms.processor).sum();
     section.time(SUM, Clock::Device, Quartiles { processor, ..Quartiles::of(&sums) });
@@ -117,6 +118,7 @@ fn measure(
         steps += 1;
         run.step(ITERATION)
     })?;
+    run.finish_step()?;
     // Without the gradients that the separate passes below write.
     let peak = device.memory().peak as f64 / f64::from(1 << 20);
     let allocations = (device.memory().allocations - before) as f64 / steps as f64;

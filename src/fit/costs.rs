@@ -58,7 +58,7 @@ fn commands_of_a_step_do_not_grow() {
 
 #[test]
 fn memory_of_training_does_not_grow() {
-    for (degree, most) in [(0, 427.0), (3, 967.0)] {
+    for (degree, most) in [(0, 335.0), (3, 695.0)] {
         let [small, large] = [100_000, 200_000].map(|splats| step(splats, [64, 48], degree).bytes);
         let per_splat = (large - small) / 1e5;
         println!("SH {degree}: {per_splat:.1} bytes per splat");

@@ -229,7 +229,7 @@ impl<'a> Run<'a> {
         let loss = device.buffer::<f32>("language loss", views.most_pixels())?;
         let order = ViewOrder::new(cameras.len(), 0, options.seed);
         Ok(Run {
-            trainer: Trainer::new(device, raster, model, views, cameras.to_vec(), order),
+            trainer: Trainer::new(device, raster, model, views, cameras.to_vec(), order)?,
             options,
             levels: levels.to_vec(),
             width,
@@ -368,11 +368,14 @@ impl Training for Run<'_> {
         Ok(())
     }
 
-    fn review(&mut self, step: usize) -> Result<StepReport> {
+    fn review_is_due(&self, step: usize) -> bool {
         let LanguageOptions { check_every: every, iterations: last, .. } = *self.options;
         // A run that is measured only at its end needs no measurement at its start.
-        let due = step == last || (step.is_multiple_of(every) && every < last);
-        if every == 0 || !due {
+        every > 0 && (step == last || (step.is_multiple_of(every) && every < last))
+    }
+
+    fn review(&mut self, step: usize) -> Result<StepReport> {
+        if !self.review_is_due(step) {
             return Ok(StepReport::default());
         }
         self.trainer.model.check(step)?;

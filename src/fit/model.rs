@@ -47,7 +47,7 @@ pub(super) struct Model {
     pub(super) feature_gradients: Buffer<f32>,
     moments: [Moments; 5],
     feature_moments: Moments,
-    schedule: Schedule,
+    pub(super) schedule: Schedule,
     /// Largest log-scale of each of the last rows, the splats that no photo shows.
     pub(super) unseen: Vec<f32>,
     /// Number of steps in the moments.

@@ -241,7 +241,7 @@ impl<'a> Run<'a> {
         let model = Model::new(device, start, 0)?;
         let order = ViewOrder::new(photos.cameras.len(), virtual_views.cameras.len(), options.seed);
         let cameras = [photos.cameras, &virtual_views.cameras].concat();
-        let trainer = Trainer::new(device, raster, model, views, cameras, order);
+        let trainer = Trainer::new(device, raster, model, views, cameras, order)?;
         Ok(Run {
             trainer,
             options,
@@ -303,10 +303,22 @@ impl<'a> Run<'a> {
         Ok(point)
     }
 
+    fn is_measured_at(&self, step: usize) -> bool {
+        step > 0 && (step.is_multiple_of(self.options.report_every.max(1)) || step == self.options.iterations)
+    }
+
+    fn grows_at(&self, step: usize) -> bool {
+        self.density.as_ref().is_some_and(|density| density.is_due(step, self.options.iterations))
+    }
+
+    fn is_pruned_at(&self, step: usize) -> bool {
+        let RgbOptions { prune_every: every, prune_from, .. } = *self.options;
+        every > 0 && step >= prune_from && step.is_multiple_of(every)
+    }
+
     /// Removes faint splats and clamps the others to the bounds.
     fn prune(&mut self, step: usize) -> Result<()> {
-        let every = self.options.prune_every;
-        if every == 0 || step < self.options.prune_from || !step.is_multiple_of(every) {
+        if !self.is_pruned_at(step) {
             return Ok(());
         }
         let model = &mut self.trainer.model;
@@ -325,9 +337,9 @@ impl<'a> Run<'a> {
 
     /// Lets splats grow where that is due.
     fn densify(&mut self, step: usize) -> Result<()> {
-        let (t, extent) = (&mut self.trainer, self.scale.extent);
+        let (is_due, t, extent) = (self.grows_at(step), &mut self.trainer, self.scale.extent);
         match &self.density {
-            Some(density) if density.is_due(step, self.options.iterations) => {
+            Some(density) if is_due => {
                 density.grow(&mut t.model, extent, self.options.seed ^ (step as u64) << 32)?;
                 self.forget_density()
             }
@@ -438,12 +450,14 @@ impl Training for Run<'_> {
         self.move_camera(view, iteration)
     }
 
+    fn review_is_due(&self, step: usize) -> bool {
+        self.is_measured_at(step) || self.grows_at(step) || self.is_pruned_at(step)
+    }
+
     fn review(&mut self, step: usize) -> Result<StepReport> {
         let mut report = StepReport::default();
-        let every = self.options.report_every.max(1);
-        let is_due = step > 0 && (step.is_multiple_of(every) || step == self.options.iterations);
         // Since the last point, all steps may have been on virtual views.
-        if is_due && !self.recent.is_empty() {
+        if self.is_measured_at(step) && !self.recent.is_empty() {
             let CurvePoint { loss, ssim, psnr, splats, .. } = self.measure(step)?;
             report.note = Some(format!("loss {loss:.4}, PSNR {psnr:.1}, {splats} splats"));
             report.figures = vec![("loss", loss), ("psnr", psnr), ("splats", splats as f64)];

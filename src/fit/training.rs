@@ -4,8 +4,9 @@ use super::model::{self, Model};
 use super::schedule::ViewOrder;
 use super::views::Views;
 use crate::checkpoint::Checkpoint;
-use crate::gpu::{Device, Program, Recorder};
+use crate::gpu::{Buffer, Device, Program, Recorder, Running};
 use crate::pass::rasterizer::{RasterOptions, Rasterizer, SplatBuffers};
+use crate::pass::view_buffers::ViewBuffers;
 use crate::progress::Progress;
 use crate::scene::Camera;
 use crate::{Error, Result};
@@ -22,8 +23,28 @@ pub(crate) struct Trainer {
     order: ViewOrder,
     /// One recorded step per view; `None` after a change of its buffers.
     programs: Vec<Option<Program>>,
+    buffers: Vec<StepBuffers>,
+    /// The step that the device may still work on.
+    in_flight: Option<Flight>,
+    /// Whether a step starts before the one before it has ended: the host has work between steps,
+    /// and a GPU would wait for it.
+    overlaps: bool,
     /// Number of the model: a stage with a model per level trains several in turn.
     group: usize,
+}
+
+/// Buffers of one view that the host writes before its step and reads after it.
+struct StepBuffers {
+    view: ViewBuffers,
+    sums: Buffer<f32>,
+    rates: Buffer<f32>,
+}
+
+/// A started step.
+struct Flight {
+    view: usize,
+    iteration: usize,
+    running: Running,
 }
 
 /// Training stage: the losses, schedule and measurements that it adds to [`Trainer`].
@@ -37,38 +58,80 @@ pub(crate) trait Training {
     fn schedule(&mut self, iteration: usize) -> Result<()>;
     /// Records forward pass, losses, backward pass and Adam of one view.
     fn record(&self, view: usize) -> Recorder;
-    /// Reads the results of a step on `view` that the host needs.
+    /// Reads the results of a step on `view` that the host needs. The device may work on the next
+    /// step already.
     fn read_back(&mut self, view: usize, iteration: usize) -> Result<()>;
-    /// Measures and prunes after `step` steps, where that is due.
+    /// Whether [`Training::review`] has work after `step` steps.
+    fn review_is_due(&self, step: usize) -> bool;
+    /// Measures and prunes after `step` steps, where that is due. No step is in flight.
     fn review(&mut self, step: usize) -> Result<StepReport>;
     fn stage_state(&self) -> Result<Self::StageState>;
     fn set_stage_state(&mut self, state: Self::StageState) -> Result<()>;
 
-    /// One step on the next view.
+    /// Starts a step on the next view and ends the one before it.
     fn step(&mut self, iteration: usize) -> Result<()> {
+        let view = self.trainer_mut().order.draw();
+        if self.trainer().in_flight.as_ref().is_some_and(|flight| flight.view == view) {
+            // Its end moves the camera of the view.
+            self.finish_step()?;
+        }
+        self.trainer_mut().select(view)?;
         self.schedule(iteration)?;
         let trainer = self.trainer_mut();
-        let view = trainer.order.draw();
         trainer.views.set_camera(view, &trainer.cameras[view])?;
-        // A step whose tile lists were too short has changed nothing.
-        loop {
-            let program = match self.trainer_mut().programs[view].take() {
-                Some(program) => program,
-                None => self.record(view).compile()?,
-            };
-            program.run()?;
-            let trainer = self.trainer_mut();
-            trainer.programs[view] = Some(program);
-            let raster = &mut trainer.views.raster;
-            match raster.overflow()? {
-                None => break,
-                Some(needed) => {
-                    raster.grow(needed)?;
-                    trainer.forget_recordings();
-                }
-            }
+        let running = recorded(self, view)?.start()?;
+        let earlier = self.trainer_mut().in_flight.replace(Flight { view, iteration, running });
+        if let Some(earlier) = earlier {
+            end(self, earlier)?;
         }
-        self.read_back(view, iteration)
+        if self.trainer().overlaps { Ok(()) } else { self.finish_step() }
+    }
+
+    /// Waits for the step in flight.
+    fn finish_step(&mut self) -> Result<()> {
+        match self.trainer_mut().in_flight.take() {
+            Some(flight) => end(self, flight),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The recorded step of a view, for which the view is selected.
+fn recorded<T: Training + ?Sized>(run: &mut T, view: usize) -> Result<Program> {
+    match run.trainer_mut().programs[view].take() {
+        Some(program) => Ok(program),
+        None => Ok(run.record(view).compile()?),
+    }
+}
+
+/// Waits for a step and reads its results.
+fn end<T: Training + ?Sized>(run: &mut T, Flight { view, iteration, running }: Flight) -> Result<()> {
+    run.trainer_mut().programs[view] = Some(running.wait()?);
+    read_results(run, view, iteration)
+}
+
+/// Reads the results of a step that has ended; first repeats it where its tile lists were too
+/// short, since it has then changed nothing.
+fn read_results<T: Training + ?Sized>(run: &mut T, view: usize, iteration: usize) -> Result<()> {
+    run.trainer_mut().select(view)?;
+    let mut later = None;
+    while let Some(needed) = run.trainer().views.raster.overflow()? {
+        let trainer = run.trainer_mut();
+        if let Some(flight) = trainer.in_flight.take() {
+            // It uses the lists that are about to grow.
+            flight.running.wait()?;
+            later = Some((flight.view, flight.iteration));
+        }
+        trainer.views.raster.grow(needed)?;
+        trainer.forget_recordings();
+        let program = recorded(run, view)?;
+        program.run()?;
+        run.trainer_mut().programs[view] = Some(program);
+    }
+    run.read_back(view, iteration)?;
+    match later {
+        Some((view, iteration)) => read_results(run, view, iteration),
+        None => Ok(()),
     }
 }
 
@@ -111,17 +174,35 @@ impl Trainer {
         views: Views,
         cameras: Vec<Camera>,
         order: ViewOrder,
-    ) -> Trainer {
-        Trainer {
+    ) -> Result<Trainer> {
+        let one = || {
+            let view = ViewBuffers::new(device)?;
+            let sums = device.buffer::<f32>("loss sums", views.sums.len())?;
+            Ok(StepBuffers { view, sums, rates: model.schedule.new_rates(device)? })
+        };
+        let buffers = cameras.iter().map(|_| one()).collect::<Result<_>>()?;
+        Ok(Trainer {
             device: device.clone(),
             raster,
             model,
             views,
             order,
             programs: cameras.iter().map(|_| None).collect(),
+            buffers,
+            in_flight: None,
+            overlaps: !device.info().is_cpu,
             cameras,
             group: 0,
-        }
+        })
+    }
+
+    /// Prepares recordings, runs and reads of a view.
+    fn select(&mut self, view: usize) -> Result<()> {
+        let StepBuffers { view: buffers, sums, rates } = &self.buffers[view];
+        self.views.raster.use_buffers(buffers);
+        self.views.sums = sums.clone();
+        self.model.schedule.use_rates(rates);
+        self.views.raster.set_size(self.views.list[view].size)
     }
 
     /// Drops all recordings, after a change of their buffers or contents.
@@ -148,7 +229,12 @@ pub(super) fn train<T: Training>(
     let first = (group * iterations) as u64;
     let mut note = String::new();
     let mut review = |run: &mut T, step: usize| {
-        let StepReport { figures, note: news, finished } = run.review(step)?;
+        let mut report = StepReport::default();
+        if run.review_is_due(step) {
+            run.finish_step()?;
+            report = run.review(step)?;
+        }
+        let StepReport { figures, note: news, finished } = report;
         if !figures.is_empty() {
             progress.figures(first + step as u64, &figures);
         }
@@ -163,6 +249,7 @@ pub(super) fn train<T: Training>(
     }
     for iteration in done..iterations {
         if progress.cancelled() {
+            run.finish_step()?;
             save(run, iteration, progress)?;
             return Err(Error::Cancelled);
         }
@@ -172,13 +259,16 @@ pub(super) fn train<T: Training>(
             break;
         }
         if progress.checkpoint().is_some_and(Checkpoint::due) {
+            run.finish_step()?;
             save(run, step, progress)?;
         }
         if progress.wants_splats() {
+            run.finish_step()?;
             let Trainer { model, cameras, .. } = run.trainer();
             progress.splats(model.splats()?, cameras);
         }
     }
+    run.finish_step()?;
     run.trainer().model.check(iterations)
 }
 
@@ -204,250 +294,4 @@ fn restore<T: Training>(run: &mut T, progress: &dyn Progress) -> Result<usize> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::fit::losses::Losses;
-    use crate::fit::rgb::fit_photos;
-    use crate::fit::{
-        DensifyOptions, LanguageOptions, LanguageRun, Photos, Preset, RgbOptions, RgbRun, pose::PoseOptions,
-        scale::SceneScale, schedule::Exponential,
-    };
-    use crate::gpu::{Device, KernelVariant, Options, TestDevice};
-    use crate::scene::seeded;
-    use crate::scene::{Camera, Codebook, Image, LevelField, Pose, RgbImage, Splats};
-    use glam::DVec3;
-    use std::time::Duration;
-
-    const COUNTED: usize = 8;
-
-    /// Cost per step of a stage once every view is recorded, and its results.
-    #[derive(Debug, PartialEq)]
-    struct Outcome {
-        submissions: f64,
-        allocations: f64,
-        splats: Splats,
-        features: Vec<f32>,
-        camera: Vec<f32>,
-    }
-
-    fn device(staging: bool) -> TestDevice {
-        TestDevice::open(&Options { staging, deterministic: true, ..crate::gpu::options(None) }).unwrap()
-    }
-
-    fn scene() -> (Splats, Vec<Camera>, Vec<RgbImage>) {
-        let (splats, camera) = seeded::small(300, 75, 53, 0, 3);
-        let cameras: Vec<Camera> = [0.0, 0.01]
-            .map(|a| Camera {
-                pose: Pose::exp(DVec3::ZERO, DVec3::X * a).compose(&camera.pose),
-                ..camera.clone()
-            })
-            .into();
-        let image = |i: usize| {
-            (0..75 * 53).map(|p| [0, 1, 2].map(|c| ((p * (c + 2) + i) % 17) as f32 / 16.0)).collect()
-        };
-        (splats, cameras, (0..2).map(|i| RgbImage { width: 75, height: 53, data: image(i) }).collect())
-    }
-
-    fn measure(device: &Device, run: &mut impl Training) -> Outcome {
-        for iteration in 0..COUNTED {
-            run.step(iteration).unwrap();
-        }
-        let before = (device.submissions(), device.memory().allocations);
-        for iteration in COUNTED..2 * COUNTED {
-            run.step(iteration).unwrap();
-        }
-        let submissions = (device.submissions() - before.0) as f64 / COUNTED as f64;
-        let allocations = (device.memory().allocations - before.1) as f64 / COUNTED as f64;
-        let resources = run.trainer().step_resources();
-        let (splats, features) = resources.params.download().unwrap();
-        let camera = resources.raster.camera().cast::<f32>().read().unwrap();
-        Outcome { submissions, allocations, splats, features, camera }
-    }
-
-    fn colour_options() -> RgbOptions {
-        let rate = Exponential { start: 1e-3, end: 1e-4, steps: 2 * COUNTED };
-        // Slow enough that no tile list grows while steps are counted.
-        let rates = RgbOptions::preset(Preset::Paper).rates;
-        RgbOptions { poses: Some(PoseOptions { start: 0, rate }), rates, ..RgbOptions::preset(Preset::Draft) }
-    }
-
-    fn colour(device: &Device) -> Outcome {
-        let (splats, cameras, images) = scene();
-        let options = colour_options();
-        let scale = SceneScale::measure(&cameras, &splats.means);
-        let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
-        let mut run = RgbRun::new(device, photos, &splats, scale, &options).unwrap();
-        measure(device, &mut run)
-    }
-
-    fn language(device: &Device) -> Outcome {
-        let (splats, cameras, images) = scene();
-        let labels = |v: usize| (0..75 * 53).map(|p| ((p / 9 + v) % 3) as i32).collect();
-        let level = LevelField {
-            codebook: Codebook {
-                embedding_dim: 1,
-                code_dim: 3,
-                embeddings: vec![1.0; 3],
-                codes: vec![1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-                ..Codebook::default()
-            },
-            targets: (0..2).map(|v| Image { width: 75, height: 53, data: labels(v) }).collect(),
-            ..LevelField::default()
-        };
-        let options = LanguageOptions::preset(Preset::Draft);
-        let mut run = LanguageRun::new(
-            device,
-            Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] },
-            &splats,
-            &[(0, &level)],
-            &options,
-            &crate::progress::Silent,
-        )
-        .unwrap();
-        measure(device, &mut run)
-    }
-
-    /// Views of two sizes put their gradients at different places of one buffer.
-    #[test]
-    fn sizes_leave_each_other_no_gradients() {
-        let device = device(false);
-        let (splats, mut cameras, mut images) = scene();
-        (cameras[1].width, cameras[1].height) = (40, 30);
-        images[1] = RgbImage { width: 40, height: 30, data: images[1].data[..40 * 30].to_vec() };
-        let options = LanguageOptions { detach_geometry: true, ..LanguageOptions::preset(Preset::Draft) };
-        let level = LevelField {
-            codebook: Codebook {
-                embedding_dim: 1,
-                code_dim: 1,
-                embeddings: vec![1.0],
-                codes: vec![1.0],
-                ..Codebook::default()
-            },
-            targets: images
-                .iter()
-                .map(|i| Image { width: i.width, height: i.height, data: vec![0; i.data.len()] })
-                .collect(),
-            ..LevelField::default()
-        };
-        let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
-        let mut run =
-            LanguageRun::new(&device, photos, &splats, &[(0, &level)], &options, &crate::progress::Silent)
-                .unwrap();
-        for iteration in 0..4 {
-            run.step(iteration).unwrap();
-            let frame = run.trainer().step_resources().raster.frame();
-            let (pixels, written) = (frame.pixels() as usize, frame.planes_grad.read().unwrap());
-            assert!(written[..4 * pixels].iter().all(|g| *g == 0.0), "gradients by colours");
-            assert!(written[4 * pixels..5 * pixels].iter().any(|g| *g != 0.0));
-        }
-    }
-
-    #[test]
-    fn step_is_one_submission_without_allocation() {
-        let (mapped, staged) = (device(false), device(true));
-        assert!(!staged.info().mapped);
-        for stage in [colour, language] {
-            let (here, there) = (stage(&mapped), stage(&staged));
-            assert_eq!((there.submissions, there.allocations), (1.0, 0.0));
-            assert_eq!(here, there, "other bits without mapped memory");
-        }
-    }
-
-    /// Parameters after training with each update.
-    fn by_update(train: impl Fn(&Device) -> [Vec<f32>; 6]) -> [[Vec<f32>; 6]; 2] {
-        [KernelVariant::FusedUpdate, KernelVariant::SeparateUpdate].map(|disabled| {
-            let disabled = [disabled.name().to_owned()].into();
-            let options = Options { disabled, deterministic: true, ..crate::gpu::options(None) };
-            train(&TestDevice::open(&options).unwrap())
-        })
-    }
-
-    fn numbers(splats: Splats, features: Vec<f32>) -> [Vec<f32>; 6] {
-        let Splats { means, log_scales, quats, opacity_logits, sh, .. } = splats;
-        let [means, log_scales] = [means, log_scales].map(|v| v.as_flattened().to_vec());
-        [means, log_scales, quats.as_flattened().to_vec(), opacity_logits, sh, features]
-    }
-
-    /// Adam's first steps have the length of the rate whatever the gradient, so that where it is
-    /// rounding alone the parameters may go apart: these are the outliers.
-    fn assert_same_training([separate, fused]: [[Vec<f32>; 6]; 2]) {
-        for (class, (a, b)) in separate.iter().zip(&fused).enumerate() {
-            assert_eq!(a.len(), b.len(), "class {class}");
-            let apart = a.iter().zip(b).filter(|(a, b)| (**a - **b).abs() > 1e-5 * (1.0 + a.abs())).count();
-            println!("class {class}: {apart} of {} numbers", a.len());
-            assert!(apart * 100 <= a.len(), "class {class}: {apart} of {} numbers", a.len());
-        }
-    }
-
-    /// With refined poses, penalised needles and pruning.
-    #[test]
-    fn fused_update_trains_the_same() {
-        let (_, cameras, images) = scene();
-        for sh_degree in [0, 3] {
-            let (mut start, _) = seeded::small(301, 75, 53, sh_degree, 3);
-            start.log_scales[0] = [-1.0, -4.0, -4.0];
-            start.opacity_logits[1] = -9.0;
-            let options = RgbOptions {
-                iterations: 2 * COUNTED,
-                prune_from: COUNTED,
-                prune_every: COUNTED,
-                losses: Losses { needles: Some(0.1), ..Losses::PHOTOS },
-                ..colour_options()
-            };
-            let scale = SceneScale::measure(&cameras, &start.means);
-            let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
-            assert_same_training(by_update(|device| {
-                let silent = &crate::progress::Silent;
-                let out = fit_photos(device, photos, start.clone(), scale, &options, silent).unwrap();
-                assert!(out.splats.len() < start.len(), "pruned");
-                numbers(out.splats, Vec::new())
-            }));
-        }
-        assert_same_training(by_update(|device| {
-            let Outcome { splats, features, .. } = language(device);
-            numbers(splats, features)
-        }));
-    }
-
-    /// Progress with a checkpoint only.
-    struct CheckpointOnly(Checkpoint);
-
-    impl Progress for CheckpointOnly {
-        fn begin(&self, _: &'static str, _: u64) {}
-        fn step(&self, _: u64, _: &str) {}
-        fn end(&self) {}
-        fn warn(&self, _: &str) {}
-        fn checkpoint(&self) -> Option<&Checkpoint> {
-            Some(&self.0)
-        }
-    }
-
-    /// With splats that grow between checkpoint and end, by sums from before the checkpoint.
-    #[test]
-    fn resumed_training_has_the_same_bits() {
-        let device = device(false);
-        let (splats, cameras, images) = scene();
-        let scale = SceneScale::measure(&cameras, &splats.means);
-        let photos = Photos { images: &images, cameras: &cameras, depths: None, coverage: &[] };
-        let growing = DensifyOptions { every: COUNTED + 4, gradient: 1e-6, ..DensifyOptions::PUBLISHED };
-        for densify in [None, Some(growing)] {
-            let options = RgbOptions { densify, ..colour_options() };
-            let new = || RgbRun::new(&device, photos, &splats, scale, &options).unwrap();
-            let folder = tempfile::tempdir().unwrap();
-            let progress = CheckpointOnly(Checkpoint::new(folder.path().join("state"), Duration::ZERO, true));
-            let (mut whole, mut resumed) = (new(), new());
-            (0..COUNTED).for_each(|iteration| whole.step(iteration).unwrap());
-            save(&whole, COUNTED, &progress).unwrap();
-            assert_eq!(restore(&mut resumed, &progress).unwrap(), COUNTED);
-            let [a, b] = [&mut whole, &mut resumed].map(|run| {
-                for iteration in COUNTED..2 * COUNTED {
-                    run.step(iteration).unwrap();
-                    run.review(iteration + 1).unwrap();
-                }
-                (run.trainer().step_resources().params.download().unwrap(), run.trainer().cameras.clone())
-            });
-            assert!(a == b, "other bits");
-            assert_eq!(a.0.0.len() > splats.len(), densify.is_some(), "{} splats", a.0.0.len());
-        }
-    }
-}
+mod tests;

@@ -88,6 +88,16 @@ impl Schedule {
         Ok(self.rates.write(all.as_flattened())?)
     }
 
+    /// A buffer for the rates of other steps: steps that the device has at once must not share one.
+    pub fn new_rates(&self, device: &Device) -> Result<Buffer<f32>> {
+        Ok(device.buffer::<f32>("adam rates", self.rates.len())?)
+    }
+
+    /// Uses this buffer for the rates of later recordings and steps.
+    pub fn use_rates(&mut self, rates: &Buffer<f32>) {
+        self.rates = rates.clone();
+    }
+
     /// Number of non-finite gradients that the steps so far have skipped.
     pub fn faults(&self) -> Result<u32> {
         Ok(self.faults.read()?.first().copied().unwrap_or(0))

@@ -37,6 +37,7 @@ pub mod sum;
 mod sweep_window;
 pub mod tile_lists;
 pub mod view;
+pub mod view_buffers;
 
 pub use choices::DeviceChoices;
 pub use frame::{FrameBuffers, GradientReduction, TileSums};

@@ -82,8 +82,8 @@ pub struct Rasterizer {
     capacity: usize,
     /// Most pixels of a band, and tiles.
     room: [usize; 2],
-    camera: Buffer<CameraView>,
-    frame: FrameBuffers,
+    pub(super) camera: Buffer<CameraView>,
+    pub(super) frame: FrameBuffers,
     grouping: TileBinning,
     sh_gradients: ShGradientKernel,
     projection_groups: u32,

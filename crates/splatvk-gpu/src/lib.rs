@@ -117,7 +117,7 @@ pub use info::{DeviceInfo, LOOP_ROUNDS, NATIVE_FLOAT_ATOMICS, Options};
 pub use memory::Memory;
 pub use module::{Access, Binding, Capability, Family, Module};
 pub use native::{Memory as NativeMemory, Native, NativeCall};
-pub use program::Program;
+pub use program::{Program, Running};
 pub use recorder::Recorder;
 pub use survey::{Survey, Surveyed, survey};
 #[cfg(feature = "testing")]

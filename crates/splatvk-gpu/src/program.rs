@@ -17,6 +17,9 @@ use std::ops::Range;
 use std::sync::Mutex;
 use std::time::Instant;
 
+mod running;
+pub use running::Running;
+
 /// A recording ready to run, any number of times. It keeps its buffers alive.
 pub struct Program {
     device: Device,
@@ -110,7 +113,7 @@ impl Program {
             let commands: Vec<&Op> = self.commands.iter().map(|c| &c.op).collect();
             return executor.run(&commands).map_err(|e| Error::refused(format!("{}: {e}", self.label)));
         }
-        self.results.iter().for_each(|(buffer, _)| buffer.set_fetched(false));
+        self.forget_results();
         for segment in segments {
             match segment {
                 Segment::Device(commands) => self.device.submit(*commands, fence, &self.label)?,
@@ -123,8 +126,18 @@ impl Program {
                 }
             }
         }
-        self.results.iter().for_each(|(buffer, fetched)| buffer.set_fetched(*fetched));
+        self.note_results();
         Ok(())
+    }
+
+    /// Marks what the host has of the results as outdated.
+    fn forget_results(&self) {
+        self.results.iter().for_each(|(buffer, _)| buffer.set_fetched(false));
+    }
+
+    /// Marks the downloaded results as those of the last run, which has ended.
+    fn note_results(&self) {
+        self.results.iter().for_each(|(buffer, fetched)| buffer.set_fetched(*fetched));
     }
 
     /// Divides the commands by where they run: whether in native code, and which. Fills and copies
@@ -457,7 +470,8 @@ impl Drop for Program {
     fn drop(&mut self) {
         let device = &self.device.0.device;
         let raw = lock(&self.raw);
-        // SAFETY: every run waits, so nothing is pending; null handles are allowed.
+        // SAFETY: every run waits, also that of a dropped `Running`, so nothing is pending; null
+        // handles are allowed.
         unsafe {
             device.destroy_fence(raw.fence, None);
             device.destroy_command_pool(raw.pool, None);

@@ -40,6 +40,34 @@ fn transfers_share_a_submission() {
 }
 
 #[test]
+fn started_programs_run_in_order() {
+    for device in [test_device(), staged()] {
+        let words: Vec<u32> = (0..1000).collect();
+        let buffers = [0, 1, 2].map(|_| device.buffer::<u32>("words", words.len()).unwrap());
+        let copy = |from: usize, to: usize| {
+            let mut rec = Recorder::new(&device, "copy");
+            rec.copy_bytes(&buffers[from], 0, &buffers[to], 0, buffers[from].bytes());
+            rec.download(&buffers[to]);
+            rec.compile().unwrap()
+        };
+        let (mut first, mut second) = (copy(0, 1), copy(1, 2));
+        for round in 1..4 {
+            let numbers: Vec<u32> = words.iter().map(|word| word * round).collect();
+            buffers[0].write(&numbers).unwrap();
+            let before = device.submissions();
+            let (a, b) = (first.start().unwrap(), second.start().unwrap());
+            assert_eq!(device.submissions() - before, 2);
+            (first, second) = (a.wait().unwrap(), b.wait().unwrap());
+            assert_eq!(buffers[1].read().unwrap(), numbers);
+            assert_eq!(buffers[2].read().unwrap(), numbers);
+            assert_eq!(device.submissions() - before, 2, "results are downloaded");
+        }
+        // Dropped, a program that runs is waited for.
+        drop(first.start().unwrap());
+    }
+}
+
+#[test]
 fn large_transfers_are_split() {
     let device = staged();
     let count = (2 * crate::staging::MOST as usize + 4096) / 4;

@@ -9,21 +9,56 @@ use crate::sync::lock;
 use ash::vk::{self, Handle};
 use std::ops::Range;
 
+/// Commands that the device may still work on, with the transfers before them.
+#[must_use]
+pub(crate) struct Submitted {
+    fence: vk::Fence,
+    transfers: Option<(u64, Batch)>,
+}
+
 impl Device {
     /// Submits what waits for a transfer and then these commands, all at once, and waits until the
     /// device is done.
     pub(crate) fn submit(&self, commands: vk::CommandBuffer, fence: vk::Fence, what: &str) -> Result<()> {
+        let submitted = self.send(commands, fence, what)?;
+        self.wait(submitted, what)
+    }
+
+    /// [`Device::submit`] without the wait. The fence belongs to the submission until
+    /// [`Device::wait`].
+    pub(crate) fn send(
+        &self,
+        commands: vk::CommandBuffer,
+        fence: vk::Fence,
+        what: &str,
+    ) -> Result<Submitted> {
         let mut staging = lock(&self.0.staging);
-        let flight = self.launch(&mut staging)?;
-        let first = flight.iter().map(|(_, batch)| batch.commands);
+        let transfers = self.launch(&mut staging)?;
+        let first = transfers.iter().map(|(_, batch)| batch.commands);
         let all: Vec<_> = first.chain([commands]).collect();
         let sent = self.queue_submit(&[vk::SubmitInfo::default().command_buffers(&all)], fence);
         drop(staging);
-        let done = sent.map_err(vk_error(what)).and_then(|()| self.finish(fence, what));
-        if let Some((number, batch)) = flight {
+        let submitted = Submitted { fence, transfers };
+        match sent {
+            Ok(()) => Ok(submitted),
+            Err(e) => {
+                self.land(submitted);
+                Err(vk_error(what)(e))
+            }
+        }
+    }
+
+    /// Waits until the device is done.
+    pub(crate) fn wait(&self, submitted: Submitted, what: &str) -> Result<()> {
+        let done = self.finish(submitted.fence, what);
+        self.land(submitted);
+        done
+    }
+
+    fn land(&self, submitted: Submitted) {
+        if let Some((number, batch)) = submitted.transfers {
             lock(&self.0.staging).land(&self.0.device, &self.0.heap, number, batch);
         }
-        done
     }
 
     /// Submits what waits for a transfer, if anything does.
