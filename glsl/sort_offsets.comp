@@ -5,7 +5,8 @@
 layout(local_size_x = 256) in;
 
 layout(std430, binding = 0) buffer Histogram { uint histogram[]; }; // [lanes, 256]
-layout(push_constant) uniform Push { uint lanes; };
+layout(std430, binding = 1) writeonly buffer Counts { uint counts[]; }; // see pass::sort
+layout(push_constant) uniform Push { uint lanes; uint drop; };
 
 shared uint totals[2][256];
 
@@ -25,6 +26,7 @@ void main() {
         barrier();
     }
     uint place = totals[side][digit] - total;
+    if (drop != 0u && digit == 255u) counts[0] = totals[side][digit];
     for (uint lane = 0u; lane < lanes; lane++) {
         uint slot = lane * 256u + digit;
         uint here = histogram[slot];

@@ -19,12 +19,12 @@
 layout(local_size_x = 8 * SUBGROUP_SIZE) in;
 
 layout(std430, binding = 0) readonly buffer Pairs { uvec2 pairs[]; };         // [N] (key, value)
-layout(std430, binding = 1) readonly buffer Count { uint count; };            // N
+layout(std430, binding = 1) buffer Counts { uint counts[]; };                 // see pass::sort
 // From first_digit on: [4, 256] counts of the digits, and for each pass [stride], zero at first: the
 // next tile number, then the status of each (tile, digit).
 layout(std430, binding = 2) buffer Zeros { uint zeros[]; };
 layout(std430, binding = 3) writeonly buffer Sorted { uvec2 sorted[]; };      // [N]
-layout(push_constant) uniform Push { uint pass; uint mask; uint first_digit; uint stride; };
+layout(push_constant) uniform Push { uint pass; uint mask; uint first_digit; uint stride; uint drop; };
 
 #include "shared/ballot.glsl"
 #include "shared/look_back.glsl"
@@ -47,7 +47,10 @@ shared uvec2 staged[TILE];
 
 uint digit_of(uint key) { return ((key & mask) >> (8u * pass)) & 255u; }
 
-// Aggregate of one digit of a preceding tile, which is always full.
+bool is_kept(uint key) { return drop == 0u || (key & mask) != mask; }
+
+// Aggregate of one digit of a preceding tile, which is always full. Dropped pairs have the last
+// digit.
 uint count_digit(uint tile, uint digit) {
     uint n = 0u;
     for (uint i = tile * TILE; i < (tile + 1u) * TILE; i += 8u) {
@@ -55,6 +58,10 @@ uint count_digit(uint tile, uint digit) {
         uvec4 b = uvec4(pairs[i + 4u].x, pairs[i + 5u].x, pairs[i + 6u].x, pairs[i + 7u].x);
         uvec4 same = uvec4(equal(((a & mask) >> (8u * pass)) & 255u, uvec4(digit)));
         same += uvec4(equal(((b & mask) >> (8u * pass)) & 255u, uvec4(digit)));
+        if (drop != 0u) {
+            same -= uvec4(equal(a & mask, uvec4(mask))) * uint(digit == 255u);
+            same -= uvec4(equal(b & mask, uvec4(mask))) * uint(digit == 255u);
+        }
         n += same.x + same.y + same.z + same.w;
     }
     return n;
@@ -100,7 +107,7 @@ void main() {
     if (gl_LocalInvocationID.x == 0u) next_tile = atomicAdd(zeros[next], 1u);
     for (uint i = thread; i < SUBGROUPS * 256u; i += THREADS) counters[i] = 0u;
     // Read while the tile number is on its way.
-    uint end = count;
+    uint end = counts[drop];
     uint everywhere[DIGITS_PER_THREAD];
     for (uint k = 0u; k < DIGITS_PER_THREAD; k++) {
         everywhere[k] = zeros[first_digit + pass * 256u + min(k * THREADS + thread, 255u)];
@@ -111,8 +118,7 @@ void main() {
     uint first = tile * TILE;
     if (first >= end) return;
 
-    // Ranks among the pairs of the subgroup with the same digit, in order of index. Pairs beyond
-    // the end get the last digit: they are last in order and displace no other pair.
+    // Ranks among the kept pairs of the subgroup with the same digit, in order of index.
     uvec2 own[PAIRS_PER_THREAD];
     uint ranks[PAIRS_PER_THREAD];
     for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
@@ -121,8 +127,9 @@ void main() {
     }
     for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
         uint index = first + (subgroup * PAIRS_PER_THREAD + i) * SUBGROUP_SIZE + lane;
-        uint digit = index < end ? digit_of(own[i].x) : 255u;
-        LaneSet peers = all_lanes();
+        uint digit = digit_of(own[i].x);
+        bool kept = index < end && is_kept(own[i].x);
+        LaneSet keepers = lanes_where(kept), peers = kept ? keepers : ~keepers;
         [[unroll]] for (uint bit = 0u; bit < 8u; bit++) {
             bool set = ((digit >> bit) & 1u) != 0u;
             LaneSet setters = lanes_where(set);
@@ -130,7 +137,7 @@ void main() {
         }
         uint rank = size_of(peers & lanes_before(lane));
         uint earlier = 0u;
-        if (rank == 0u) earlier = atomicAdd(counters[subgroup * 256u + digit], size_of(peers));
+        if (rank == 0u && kept) earlier = atomicAdd(counters[subgroup * 256u + digit], size_of(peers));
         ranks[i] = subgroupShuffle(earlier, lowest(peers)) + rank;
     }
     barrier();
@@ -166,12 +173,14 @@ void main() {
             for (uint s = 0u; s < SUBGROUPS; s++) counters[s * 256u + digit] += starts[k].x;
         }
     }
+    uvec2 kept_pairs = uvec2(0u); // of the tile, and of all tiles
+    for (uint c = 0u; c < 256u / SUBGROUP_SIZE; c++) kept_pairs += chunk_sums[c];
+    if (drop != 0u && tile == 0u && thread == 0u) counts[0] = kept_pairs.y;
     barrier();
     // The other tiles publish their aggregates while the pairs are staged.
     for (uint i = 0u; i < PAIRS_PER_THREAD; i++) {
         uint index = first + (subgroup * PAIRS_PER_THREAD + i) * SUBGROUP_SIZE + lane;
-        uint digit = index < end ? digit_of(own[i].x) : 255u;
-        staged[counters[subgroup * 256u + digit] + ranks[i]] = own[i];
+        if (index < end && is_kept(own[i].x)) staged[counters[subgroup * 256u + digit_of(own[i].x)] + ranks[i]] = own[i];
     }
     for (uint k = 0u; k < DIGITS_PER_THREAD; k++) {
         uint digit = k * THREADS + thread;
@@ -184,7 +193,7 @@ void main() {
     }
     barrier();
     for (uint position = thread; position < TILE; position += THREADS) {
-        if (first + position < end) {
+        if (position < kept_pairs.x) {
             uvec2 pair = staged[position];
             sorted[offsets[digit_of(pair.x)] + position] = pair;
         }

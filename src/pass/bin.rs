@@ -10,7 +10,7 @@
 //! `glsl/shared/tiles.glsl`.
 use super::frame::{FrameBuffers, GradientReduction};
 use super::project::Projected;
-use super::sort::{Prepared, rows_of_groups};
+use super::sort::{Moves, Prepared, rows_of_groups};
 use super::tile_lists::{CHUNK_SPLATS, Counting, Group, Lists, Sorting, TILE, tile_bits};
 use crate::gpu::{Buffer, Recorder, shaders};
 use std::ops::Range;
@@ -166,7 +166,8 @@ fn record_sorting(rec: &mut Recorder, frame: &FrameBuffers, rows: &Range<u32>, c
         &shaders::bin_large::Push { tiles_x, first_row, end_row, capacity, first_digit, passes, most },
     );
     rec.dispatch(call, [most.clamp(1, LARGE_GROUPS), 1, 1]);
-    sort.record_prepared(rec, &lists.entries, &lists.entry_count, bits, Prepared::Counted);
+    let moves = (&lists.entry_count, Moves::All);
+    sort.record_prepared(rec, &lists.entries, moves, bits, Prepared::Counted);
     let call = shaders::bin_ranges::call(
         shaders::bin_ranges::Variant { indexed },
         &shaders::bin_ranges::Bindings {

@@ -47,7 +47,7 @@ use super::frame::{
 use super::fused_update::{self, SplatAdam};
 use super::project::DEPTH_BITS;
 use super::project_backward::ShGradientKernel;
-use super::sort::{Prepared, Sort};
+use super::sort::{Moves, Prepared, Sort};
 use super::tile_lists::{self, LONGEST_LIST, Lists, TILE, TileBinning, TileLists};
 use super::view::View;
 use super::{bin, project, project_backward, raster_backward, raster_forward};
@@ -276,7 +276,7 @@ impl Rasterizer {
         rec.pass("depth sort");
         // The sort is stable: equal keys keep the order of the splats.
         let pairs = &self.frame.depth_pairs;
-        self.sort.record_prepared(rec, pairs, &self.count, DEPTH_BITS, Prepared::Cleared);
+        self.sort.record_prepared(rec, pairs, (&self.count, Moves::All), DEPTH_BITS, Prepared::Cleared);
     }
 
     /// Records binning and blending of a band. In a recording, band 0 directly follows

@@ -77,6 +77,25 @@ impl Key {
     }
 }
 
+/// Pairs that a sort moves.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Moves {
+    /// All of the first `counts[0]`.
+    All,
+    /// Of the first `counts[1]` those whose key is not the largest; the first pass drops the others
+    /// and writes the number of those left to `counts[0]`.
+    Visible,
+}
+
+/// One pass of a sort. `drop` is 1 where the pass drops pairs.
+#[derive(Clone, Copy)]
+struct Place<'a> {
+    counts: &'a Buffer<u32>,
+    drop: u32,
+    key: Key,
+    pass: u32,
+}
+
 /// Work that the passes before a sort did for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Prepared {
@@ -153,7 +172,7 @@ impl Sort {
             rec.fill(&self.zeros, 0);
         }
         let key = Key::new(bits);
-        self.record_passes(rec, [pairs, &self.scratch], count, key, Prepared::Cleared);
+        self.record_passes(rec, [pairs, &self.scratch], (count, Moves::All), key, Prepared::Cleared);
         if key.is_odd() {
             rec.copy_bytes(&self.scratch, 0, pairs, 0, pairs.bytes());
         }
@@ -164,18 +183,19 @@ impl Sort {
         if Key::new(bits).is_odd() { &self.scratch } else { pairs }
     }
 
-    /// [`Sort::record`] after other preparation, from [`Sort::unsorted`] to `pairs` without a copy.
+    /// [`Sort::record`] of `moves` after other preparation, from [`Sort::unsorted`] to `pairs`
+    /// without a copy.
     pub(super) fn record_prepared(
         &self,
         rec: &mut Recorder,
         pairs: &Buffer<u32>,
-        count: &Buffer<u32>,
+        moves: (&Buffer<u32>, Moves),
         bits: u32,
         prepared: Prepared,
     ) {
         let key = Key::new(bits);
         let buffers = if key.is_odd() { [&self.scratch, pairs] } else { [pairs, &self.scratch] };
-        self.record_passes(rec, buffers, count, key, prepared);
+        self.record_passes(rec, buffers, moves, key, prepared);
     }
 
     /// Records the passes from the first of two buffers, each to the other one.
@@ -183,7 +203,7 @@ impl Sort {
         &self,
         rec: &mut Recorder,
         [mut from, mut to]: [&Buffer<u32>; 2],
-        count: &Buffer<u32>,
+        (counts, moves): (&Buffer<u32>, Moves),
         key: Key,
         prepared: Prepared,
     ) {
@@ -191,31 +211,40 @@ impl Sort {
             rec.fail("sort: more pairs than the capacity of the sort");
         }
         if let (Work::Sweep { .. }, Prepared::Cleared) = (&self.work, prepared) {
-            self.record_digits(rec, from, count, key);
+            self.record_digits(rec, from, (counts, moves), key);
         }
         for pass in 0..key.passes {
+            let drop = (moves == Moves::Visible && pass == 0).into();
+            let place = Place { counts, drop, key, pass };
             match &self.work {
                 Work::Chunks { histogram, lanes } => {
-                    record_chunks(rec, (from, to), count, (histogram, *lanes), (key, pass));
+                    record_chunks(rec, (from, to), (histogram, *lanes), place);
                 }
-                Work::Sweep { stride } => self.record_sweep(rec, (from, to), count, *stride, (key, pass)),
+                Work::Sweep { stride } => self.record_sweep(rec, (from, to), *stride, place),
             }
             (from, to) = (to, from);
         }
     }
 
     /// Records the digit histograms of all passes.
-    fn record_digits(&self, rec: &mut Recorder, pairs: &Buffer<u32>, count: &Buffer<u32>, key: Key) {
+    fn record_digits(
+        &self,
+        rec: &mut Recorder,
+        pairs: &Buffer<u32>,
+        (counts, moves): (&Buffer<u32>, Moves),
+        key: Key,
+    ) {
         // About a workgroup per multiprocessor of a large GPU, which adds 1024 sums at the end.
         let rounds =
             capacity(pairs).div_ceil(256 * 128).next_multiple_of(DIGITS_BLOCK).clamp(DIGITS_BLOCK, 32);
         let call = shaders::sort_digits::call(
-            &shaders::sort_digits::Bindings { pairs, count, zeros: &self.zeros },
+            &shaders::sort_digits::Bindings { pairs, counts, zeros: &self.zeros },
             &shaders::sort_digits::Push {
                 mask: key.mask,
                 passes: key.passes,
                 first_digit: self.room as u32,
                 rounds: rounds as u32,
+                drop: (moves == Moves::Visible).into(),
             },
         );
         rec.dispatch(call, rows_of_groups(capacity(pairs).div_ceil(256 * rounds)));
@@ -225,17 +254,17 @@ impl Sort {
         &self,
         rec: &mut Recorder,
         (from, to): (&Buffer<u32>, &Buffer<u32>),
-        count: &Buffer<u32>,
         stride: usize,
-        (key, pass): (Key, u32),
+        Place { counts, drop, key, pass }: Place,
     ) {
         let call = shaders::sort_sweep::call(
-            &shaders::sort_sweep::Bindings { pairs: from, count, zeros: &self.zeros, sorted: to },
+            &shaders::sort_sweep::Bindings { pairs: from, counts, zeros: &self.zeros, sorted: to },
             &shaders::sort_sweep::Push {
                 pass,
                 mask: key.mask,
                 first_digit: self.room as u32,
                 stride: stride as u32,
+                drop,
             },
         );
         // Workgroups beyond the last tile do nothing.
@@ -246,30 +275,29 @@ impl Sort {
 fn record_chunks(
     rec: &mut Recorder,
     (from, to): (&Buffer<u32>, &Buffer<u32>),
-    count: &Buffer<u32>,
     (histogram, lanes): (&Buffer<u32>, u32),
-    (key, pass): (Key, u32),
+    Place { counts, drop, key, pass }: Place,
 ) {
     let (shift, mask) = (pass * DIGIT_BITS, key.mask);
     let groups = [lanes / shaders::sort_count::WORKGROUP[0], 1, 1];
     rec.dispatch(
         shaders::sort_count::call(
-            &shaders::sort_count::Bindings { pairs: from, count, histogram },
-            &shaders::sort_count::Push { shift, mask, lanes },
+            &shaders::sort_count::Bindings { pairs: from, counts, histogram },
+            &shaders::sort_count::Push { shift, mask, lanes, drop },
         ),
         groups,
     );
     rec.dispatch(
         shaders::sort_offsets::call(
-            &shaders::sort_offsets::Bindings { histogram },
-            &shaders::sort_offsets::Push { lanes },
+            &shaders::sort_offsets::Bindings { histogram, counts },
+            &shaders::sort_offsets::Push { lanes, drop },
         ),
         [1, 1, 1],
     );
     rec.dispatch(
         shaders::sort_scatter::call(
-            &shaders::sort_scatter::Bindings { pairs: from, count, histogram, sorted: to },
-            &shaders::sort_scatter::Push { shift, mask, lanes },
+            &shaders::sort_scatter::Bindings { pairs: from, counts, histogram, sorted: to },
+            &shaders::sort_scatter::Push { shift, mask, lanes, drop },
         ),
         groups,
     );
@@ -297,7 +325,7 @@ pub fn sort_pairs(pairs: &mut [[u32; 2]], bits: u32) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gpu::test_device;
+    use crate::gpu::{Options, TestDevice, native, options, test_device};
 
     /// Pairs with keys below `range`, values the original index.
     fn random_pairs(n: usize, range: u64, mut seed: u64) -> Vec<[u32; 2]> {
@@ -351,6 +379,45 @@ mod tests {
     #[test]
     fn sort_of_a_part_matches_reference() {
         sorted_on_device(&random_pairs(1000, 50, 3), 600, 16);
+    }
+
+    /// The largest key, of hidden splats, leaves in the first pass, whatever its share.
+    #[test]
+    fn largest_keys_are_dropped() {
+        let natives = TestDevice::open(&Options { natives: native::ALL, ..options(None) }).unwrap();
+        let shaders = test_device();
+        let ways = [
+            (&shaders, SortAlgorithm::Chunks),
+            (&shaders, SortAlgorithm::Sweep),
+            (&natives, SortAlgorithm::Chunks),
+        ];
+        for (n, of_ten, bits) in
+            [(0, 0, 24), (1, 10, 24), (700, 3, 24), (5000, 0, 24), (5000, 9, 16), (9000, 10, 24)]
+        {
+            let mask = (1 << bits) - 1;
+            let mut pairs = random_pairs(n, u64::from(mask), 5);
+            // Keys with the same last digit stay.
+            pairs.iter_mut().step_by(3).for_each(|pair| pair[0] |= 255);
+            pairs.iter_mut().filter(|pair| pair[0] == mask).for_each(|pair| pair[0] -= 256);
+            pairs.iter_mut().filter(|pair| pair[1] % 10 < of_ten).for_each(|pair| pair[0] = mask);
+            let mut expected: Vec<[u32; 2]> = pairs.iter().copied().filter(|pair| pair[0] != mask).collect();
+            sort_pairs(&mut expected, bits);
+            for (device, algorithm) in ways {
+                let sort = Sort::with(device, n.max(1), algorithm).unwrap();
+                let sorted = device.buffer::<u32>("pairs", 2 * n.max(1)).unwrap();
+                sort.unsorted(&sorted, bits).write(pairs.as_flattened()).unwrap();
+                let counts = device.buffer_from("counts", &[0, n as u32]).unwrap();
+                let mut rec = Recorder::new(device, "sort");
+                sort.record_prepared(&mut rec, &sorted, (&counts, Moves::Visible), bits, Prepared::Cleared);
+                rec.run().unwrap();
+                let left = counts.read().unwrap()[0] as usize;
+                assert_eq!(left, expected.len(), "{n} pairs, {algorithm:?}");
+                assert!(
+                    sorted.read_range(0..2 * left).unwrap() == expected.as_flattened(),
+                    "{n}, {algorithm:?}"
+                );
+            }
+        }
     }
 
     #[test]

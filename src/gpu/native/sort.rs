@@ -18,42 +18,49 @@ fn digit(key: u32, shift: u32, mask: u32) -> usize {
 }
 
 pub(super) fn count(call: &mut NativeCall) -> Result<(), String> {
-    let [shift, mask, lanes] = call.words()?;
-    let [pairs, count, histogram] = call.memory([0, 1, 2])?;
-    let (pairs, count): (&[[u32; 2]], usize) = (pairs.of(), count.of::<u32>()[0] as usize);
+    let [shift, mask, lanes, drop] = call.words()?;
+    let [pairs, counts, histogram] = call.memory([0, 1, 2])?;
+    let (pairs, count): (&[[u32; 2]], usize) = (pairs.of(), counts.of::<u32>()[drop as usize] as usize);
     let histogram = histogram.of::<u32>()[..lanes as usize * DIGITS].par_chunks_mut(DIGITS);
     histogram.enumerate().for_each(|(lane, counts)| {
         counts.fill(0);
         for pair in &pairs[chunk(lane, lanes as usize, count)] {
-            counts[digit(pair[0], shift, mask)] += 1;
+            let is_kept = drop == 0 || pair[0] & mask != mask;
+            counts[digit(pair[0], shift, mask)] += u32::from(is_kept);
         }
     });
     Ok(())
 }
 
 pub(super) fn offsets(call: &mut NativeCall) -> Result<(), String> {
-    let [lanes] = call.words()?.map(|word| word as usize);
-    let [histogram] = call.memory([0])?;
+    let [lanes, drop] = call.words()?;
+    let [histogram, counts] = call.memory([0, 1])?;
     let histogram = histogram.of::<u32>();
     let mut place = 0;
     for digit in 0..DIGITS {
-        for lane in 0..lanes {
+        for lane in 0..lanes as usize {
             let here = &mut histogram[lane * DIGITS + digit];
             (*here, place) = (place, place + *here);
         }
+    }
+    if drop != 0 {
+        counts.of::<u32>()[0] = place;
     }
     Ok(())
 }
 
 pub(super) fn scatter(call: &mut NativeCall) -> Result<(), String> {
-    let [shift, mask, lanes] = call.words()?;
-    let [pairs, count, histogram, sorted] = call.memory([0, 1, 2, 3])?;
-    let (pairs, count): (&[[u32; 2]], usize) = (pairs.of(), count.of::<u32>()[0] as usize);
+    let [shift, mask, lanes, drop] = call.words()?;
+    let [pairs, counts, histogram, sorted] = call.memory([0, 1, 2, 3])?;
+    let (pairs, count): (&[[u32; 2]], usize) = (pairs.of(), counts.of::<u32>()[drop as usize] as usize);
     let (histogram, sorted): (&[u32], _) = (histogram.of(), Scattered::new(sorted.of::<[u32; 2]>()));
     (0..lanes as usize).into_par_iter().for_each(|lane| {
         let mut places = [0; DIGITS];
         places.copy_from_slice(&histogram[lane * DIGITS..(lane + 1) * DIGITS]);
         for pair in &pairs[chunk(lane, lanes as usize, count)] {
+            if drop != 0 && pair[0] & mask == mask {
+                continue;
+            }
             let place = &mut places[digit(pair[0], shift, mask)];
             // SAFETY: the offsets of lanes and digits are disjoint.
             unsafe { sorted.set(*place as usize, *pair) };
