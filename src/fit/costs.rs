@@ -3,19 +3,10 @@
 use super::options::Rates;
 use super::scale::SceneScale;
 use super::{Photos, Preset, RgbOptions, RgbRun, Training};
-use crate::gpu::{Executor, Op, Options, TestDevice, native, options, test_device};
+use crate::gpu::{Options, TestDevice, idle_device, native, options, test_device};
 use crate::pass::{RasterOptions, Rasterizer, SplatBuffers, View, pairs};
 use crate::scene::{RgbImage, seeded};
 use std::collections::BTreeMap;
-
-/// Runs nothing: commands and buffers count, not their content.
-struct Idle;
-
-impl Executor for Idle {
-    fn run(&self, _: &[&Op]) -> Result<(), String> {
-        Ok(())
-    }
-}
 
 /// Commands and barriers of the step of `splatvk bench` on a seeded scene, its commands by pass, and
 /// the bytes of device memory of its training.
@@ -26,7 +17,7 @@ struct Step {
 }
 
 fn step(splats: usize, [width, height]: [u32; 2], degree: u32) -> Step {
-    let device = TestDevice::executed_by(Box::new(Idle), 32, &options(None)).unwrap();
+    let device = idle_device();
     let (splats, camera) = seeded::benchmark(splats, width, height, degree, 0);
     let (width, height) = (width as usize, height as usize);
     let images = [RgbImage { width, height, data: vec![[0.5; 3]; width * height] }];

@@ -190,7 +190,7 @@ fn label_weights(
     // Colours are not rendered.
     let options = RasterOptions { sh_degree: 0, ..RasterOptions::default() };
     let sizes: Vec<[u32; 2]> = cameras.iter().map(|c| [c.width, c.height]).collect();
-    let mut raster = Rasterizer::for_sizes(device, splats.len(), 0, &sizes)?;
+    let mut raster = Rasterizer::for_viewing(device, splats.len(), 0, &sizes)?;
     let mut weights = LabelWeights::new(splats.len());
     for (view, camera) in cameras.iter().enumerate() {
         progress.check()?;

@@ -11,6 +11,8 @@ mod variants;
 pub(crate) use folder::FolderCache;
 pub use options::{may_choose_kernels, open, open_with, options};
 pub use splatvk_gpu::*;
+#[cfg(test)]
+pub(crate) use testing::idle_device;
 #[doc(hidden)]
 pub use testing::test_device;
 pub use variants::{KernelVariant, VariantPair, replaces_shaders};

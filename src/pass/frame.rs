@@ -1,10 +1,11 @@
 //! Buffers of one frame, and the gradients that its backward pass stores per entry of the tile
 //! lists.
 use super::bands::Bands;
-use super::channels::{Block, blocks};
+use super::channels::{BASE_CHANNELS, Block, blocks};
+use super::choices::DeviceChoices;
 use super::tile_lists::{TILE, TileLists};
 use crate::Result;
-use crate::gpu::{self, Buffer, Device, KernelVariant, VariantPair, shaders};
+use crate::gpu::{self, Buffer, Device, KernelVariant, Recorder, VariantPair, shaders};
 use crate::sync::lock;
 use std::ops::Range;
 
@@ -24,7 +25,8 @@ pub struct FrameBuffers {
     /// [H, W] final transmittance T_f; alpha = 1 − T_f.
     pub transmittance: Buffer<f32>,
     /// [4 + d + 1, H, W]: gradient of the loss by `planes` and, last, by alpha. Zero at first; a
-    /// loss overwrites the planes that it uses. Read by the backward pass.
+    /// loss overwrites the planes that it uses. Read by the backward pass. Empty in a rasterizer
+    /// for viewing.
     pub planes_grad: Buffer<f32>,
     /// [10]: gradient by the left pose twist (ρ, θ) and by fx, fy, cx, cy. Written by the backward
     /// pass.
@@ -55,6 +57,69 @@ pub(super) struct Tiles {
 }
 
 impl FrameBuffers {
+    /// Allocates the buffers of the forward pass for images of up to `room` pixels and tiles, the
+    /// first of this size, and tile lists of `entries`. Those of the backward pass are empty.
+    pub(super) fn new(
+        device: &Device,
+        ([width, height], bands): ([u32; 2], Bands),
+        feature_dim: usize,
+        choices: &DeviceChoices,
+        (splats, [pixels, tiles], entries): (usize, [usize; 2], usize),
+    ) -> Result<FrameBuffers> {
+        let floats = |name, len| device.buffer::<f32>(name, len);
+        let codes = code_floats(feature_dim, splats);
+        Ok(FrameBuffers {
+            width,
+            height,
+            bands,
+            feature_dim,
+            planes: floats("planes", (BASE_CHANNELS + feature_dim) * pixels)?,
+            transmittance: floats("transmittance", pixels)?,
+            planes_grad: floats("planes_grad", 0)?,
+            camera_grad: floats("camera_grad", 0)?,
+            status: device.buffer::<u32>("status", 3)?,
+            projected: floats("projected", PROJECTED_FLOATS * splats)?,
+            projected_grad: floats("projected_grad", 0)?,
+            camera_parts: floats("camera_parts", 0)?,
+            summation: choices.summation,
+            tile_sums: choices.tile_sums,
+            gradient_entries: GradientEntries::default(),
+            codes: floats("codes", codes)?,
+            codes_grad: floats("codes_grad", 0)?,
+            depth_pairs: device.buffer::<u32>("depth_pairs", 2 * splats)?,
+            lists: TileLists::new(device, choices.grouping, choices.summation, splats, tiles, entries)?,
+        })
+    }
+
+    /// Allocates the buffers of the backward pass, unless they exist; `groups` of its projection
+    /// write partial gradients by the camera.
+    pub(super) fn allocate_gradients(
+        &mut self,
+        device: &Device,
+        splats: usize,
+        pixels: usize,
+        groups: usize,
+    ) -> Result<()> {
+        if !self.planes_grad.is_empty() {
+            return Ok(());
+        }
+        let floats = |name, len| device.buffer::<f32>(name, len);
+        self.camera_grad = floats("camera_grad", CAMERA_GRADIENTS)?;
+        self.camera_parts = floats("camera_parts", CAMERA_GRADIENTS * groups)?;
+        self.projected_grad = floats("projected_grad", GRADIENT_FLOATS * splats)?;
+        self.codes_grad = floats("codes_grad", code_floats(self.feature_dim, splats))?;
+        // Last, since the others exist where it does.
+        self.planes_grad = floats("planes_grad", (BASE_CHANNELS + self.feature_dim + 1) * pixels)?;
+        Ok(())
+    }
+
+    /// Refuses a recording of the backward pass without its buffers.
+    pub(super) fn require_gradients(&self, rec: &mut Recorder) {
+        if self.planes_grad.is_empty() {
+            rec.fail("a rasterizer for viewing has no buffers of the backward pass");
+        }
+    }
+
     /// Pixels of the planes: those of the image, or of a band.
     pub fn pixels(&self) -> u32 {
         self.bands.pixels() as u32
@@ -77,6 +142,11 @@ impl FrameBuffers {
     pub(super) fn code_stride(&self) -> u32 {
         (self.feature_dim as u32).next_multiple_of(4)
     }
+}
+
+/// Floats of the codes of all splats; some without features, since shaders bind them.
+fn code_floats(feature_dim: usize, splats: usize) -> usize {
+    (feature_dim.next_multiple_of(4) * splats).max(4)
 }
 
 /// Floats per splat in the gradient buffer: moments, RGB and z in whole vectors.

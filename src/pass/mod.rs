@@ -54,3 +54,5 @@ pub use view::View;
 mod reference_tests;
 #[cfg(test)]
 mod stereo_tests;
+#[cfg(test)]
+mod viewing_costs;

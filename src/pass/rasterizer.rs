@@ -40,10 +40,7 @@
 //! [`Rasterizer::record_gradients`]. An image that fits is one band.
 use super::bands::{Band, Bands};
 use super::channels::BASE_CHANNELS;
-use super::frame::{
-    CAMERA_GRADIENTS, GRADIENT_FLOATS, GradientEntries, GradientReduction, PROJECTED_FLOATS, Tiles,
-    entry_bytes,
-};
+use super::frame::{GradientReduction, Tiles, entry_bytes};
 use super::fused_update::{self, SplatAdam};
 use super::project::DEPTH_BITS;
 use super::project_backward::ShGradientKernel;
@@ -119,12 +116,27 @@ impl Rasterizer {
         height: u32,
         choices: DeviceChoices,
     ) -> Result<Rasterizer> {
-        Rasterizer::allocate(device, capacity, feature_dim, &[[width, height]], choices)
+        let mut made = Rasterizer::allocate(device, capacity, feature_dim, &[[width, height]], choices)?;
+        made.allocate_gradients()?;
+        Ok(made)
     }
 
     /// [`Rasterizer::new`] for images of several (width, height), the first until
     /// [`Rasterizer::set_size`].
     pub fn for_sizes(
+        device: &Device,
+        capacity: usize,
+        feature_dim: usize,
+        sizes: &[[u32; 2]],
+    ) -> Result<Rasterizer> {
+        let mut made = Rasterizer::for_viewing(device, capacity, feature_dim, sizes)?;
+        made.allocate_gradients()?;
+        Ok(made)
+    }
+
+    /// [`Rasterizer::for_sizes`] without the buffers of the backward pass, which
+    /// [`Rasterizer::allocate_gradients`] makes.
+    pub fn for_viewing(
         device: &Device,
         capacity: usize,
         feature_dim: usize,
@@ -145,57 +157,35 @@ impl Rasterizer {
             sizes.iter().map(|size| bands_of(device, *size, planes)).collect::<Result<_>>()?;
         let most = |count: fn(&Bands) -> usize| bands.iter().map(count).max().unwrap_or(0);
         let room = [most(Bands::pixels), most(tiles_of)];
-        let [pixels, tiles] = room;
-        let ([width, height], bands) = match (sizes, bands.into_iter().next()) {
+        let (size, bands) = match (sizes, bands.into_iter().next()) {
             ([first, ..], Some(bands)) => (*first, bands),
             _ => return Err(Error::work("a rasterizer without an image size")),
         };
         let splats = capacity.max(1);
-        let stride = feature_dim.next_multiple_of(4);
-        // About five entries per splat on the seeded scene; `forward` grows lists that are too
-        // short.
-        let most = most_entries(device, (choices.grouping, splats, tiles), choices.summation, feature_dim);
-        let entries = (6 * splats + 4 * tiles).min(most);
-        let frame = FrameBuffers {
-            width,
-            height,
-            bands,
-            feature_dim,
-            planes: device.buffer::<f32>("planes", planes * pixels)?,
-            transmittance: device.buffer::<f32>("transmittance", pixels)?,
-            planes_grad: device.buffer::<f32>("planes_grad", (planes + 1) * pixels)?,
-            camera_grad: device.buffer::<f32>("camera_grad", CAMERA_GRADIENTS)?,
-            status: device.buffer::<u32>("status", 3)?,
-            projected: device.buffer::<f32>("projected", PROJECTED_FLOATS * splats)?,
-            projected_grad: device.buffer::<f32>("projected_grad", GRADIENT_FLOATS * splats)?,
-            camera_parts: device.buffer::<f32>(
-                "camera_parts",
-                CAMERA_GRADIENTS * project_backward::groups(splats, choices.projection_groups) as usize,
-            )?,
-            summation: choices.summation,
-            tile_sums: choices.tile_sums,
-            gradient_entries: GradientEntries::default(),
-            codes: device.buffer::<f32>("codes", (stride * splats).max(4))?,
-            codes_grad: device.buffer::<f32>("codes_grad", (stride * splats).max(4))?,
-            depth_pairs: device.buffer::<u32>("depth_pairs", 2 * splats)?,
-            lists: TileLists::new(device, choices.grouping, choices.summation, splats, tiles, entries)?,
-        };
-        let camera = device.buffer::<CameraView>("camera", 1)?;
-        let sort = Sort::new(device, splats)?;
-        let count = device.buffer::<u32>("splat count", 1)?;
+        let lists = (choices.grouping, splats, room[1]);
+        let most = most_entries(device, lists, choices.summation, feature_dim);
+        let entries = tile_lists::first_entries(splats, room[1]).min(most);
+        let frame = FrameBuffers::new(device, (size, bands), feature_dim, &choices, (splats, room, entries))?;
         Ok(Rasterizer {
             device: device.clone(),
             capacity,
             room,
-            camera,
+            camera: device.buffer::<CameraView>("camera", 1)?,
             frame,
             grouping: choices.grouping,
             sh_gradients: choices.sh_gradients,
             projection_groups: choices.projection_groups,
             strip: u32::MAX,
-            sort,
-            count,
+            sort: Sort::new(device, splats)?,
+            count: device.buffer::<u32>("splat count", 1)?,
         })
+    }
+
+    /// Allocates the buffers of the backward pass, unless they exist. Recordings of the forward pass
+    /// may still be run.
+    pub fn allocate_gradients(&mut self) -> Result<()> {
+        let groups = project_backward::groups(self.capacity.max(1), self.projection_groups);
+        self.frame.allocate_gradients(&self.device, self.capacity.max(1), self.room[0], groups as usize)
     }
 
     /// Sets the image size of later recordings and reads. A recording keeps its own. Planes of an
@@ -300,6 +290,7 @@ impl Rasterizer {
         options: &RasterOptions,
         band: &Band,
     ) {
+        self.frame.require_gradients(rec);
         rec.pass("raster backward");
         let coupled = options.features_move_geometry;
         let by_entries = self.frame.summation == GradientReduction::Entries;
@@ -352,6 +343,7 @@ impl Rasterizer {
         options: &RasterOptions,
         gradients: &SplatBuffers,
     ) {
+        self.frame.require_gradients(rec);
         let sh_degree = options.sh_degree.min(params.sh_degree);
         rec.pass("projection backward");
         let kernel = (self.sh_gradients, self.projection_groups);
@@ -367,6 +359,7 @@ impl Rasterizer {
         options: &RasterOptions,
         features_grad: &Buffer<f32>,
     ) {
+        self.frame.require_gradients(rec);
         rec.pass("feature backward");
         project_backward::record_features(rec, params, &self.frame, options.feature_mode, features_grad);
     }
@@ -387,6 +380,7 @@ impl Rasterizer {
                 "the update of SH degree {stored} was asked for after a render of degree {used}"
             ));
         }
+        self.frame.require_gradients(rec);
         rec.pass(fused_update::PASS);
         fused_update::record(rec, params, &self.camera, &self.frame, self.projection_groups, state);
     }

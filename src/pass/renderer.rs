@@ -136,6 +136,7 @@ impl Renderer {
         let options = RasterOptions { sh_degree: 0, ..self.options };
         let device = self.device.clone();
         let (rasterizer, splats) = self.prepare(camera)?;
+        rasterizer.allocate_gradients()?;
         let planes = planar(image);
         for index in 0..rasterizer.frame().bands.count() {
             let band = rasterizer.frame().bands.get(index);
@@ -163,7 +164,10 @@ impl Renderer {
             .is_some_and(|r| r.frame().width == camera.width && r.frame().height == camera.height);
         if !fits {
             let (count, dim) = (self.splats.count, self.splats.feature_dim);
-            self.rasterizer = Some(Rasterizer::new(&self.device, count, dim, camera.width, camera.height)?);
+            // Buffers of another size go first: two sets may not fit.
+            self.rasterizer = None;
+            let size = [camera.width, camera.height];
+            self.rasterizer = Some(Rasterizer::for_viewing(&self.device, count, dim, &[size])?);
         }
         let Some(rasterizer) = &mut self.rasterizer else {
             return Err(Error::work("the renderer lost its rasterizer"));

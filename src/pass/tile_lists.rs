@@ -173,6 +173,14 @@ fn most_lanes(tiles: usize, binding: u64) -> usize {
     (counters / tiles.max(1)).max(8) / 8 * 8
 }
 
+/// Entries that lists have room for before any frame: about five per splat lie on the seeded scene,
+/// and no frame is repeated there. Large lists begin with few, since most splats of a large scene
+/// are small or outside the view; they grow with the first frame that needs more.
+pub(super) fn first_entries(splats: usize, tiles: usize) -> usize {
+    const LARGE: usize = 1 << 24;
+    (6 * splats).min(splats.max(LARGE)) + 4 * tiles
+}
+
 /// Bytes per entry of the widest list.
 const ENTRY_BYTES: u64 = 8;
 
