@@ -10,9 +10,10 @@ layout(std430, binding = 2) writeonly buffer TileCounts { uint tile_counts[]; };
 layout(push_constant) uniform Push { uint count; uint tiles_x; uint first_row; uint end_row; };
 
 #include "shared/tiles.glsl"
+#include "shared/rows.glsl"
 
 void main() {
-    uint rank = gl_GlobalInvocationID.x;
+    uint rank = thread_number();
     if (rank >= count) return;
     Ellipse e = ellipse_of(depth_pairs[rank].y, first_row, end_row, tiles_x);
     uint sum = 0;

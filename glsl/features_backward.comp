@@ -1,6 +1,7 @@
 #version 450
 // Gradient by the stored features from the gradient by the rendered ones, per block of `width`
 // numbers. Reference: pass::project_backward::features_reference.
+#extension GL_GOOGLE_include_directive : require
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer Features { float features[]; };          // [N, dim]
@@ -8,8 +9,10 @@ layout(std430, binding = 1) readonly buffer CodesGrad { float codes_grad[]; };  
 layout(std430, binding = 2) writeonly buffer FeaturesGrad { float features_grad[]; }; // [N, dim]
 layout(push_constant) uniform Push { uint count; uint dim; uint stride; uint width; float epsilon; };
 
+#include "shared/rows.glsl"
+
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = thread_number();
     if (i >= count) return;
     for (uint first = 0; first < dim; first += width) {
         float scale = 1.0, radial = 0.0;

@@ -2,6 +2,7 @@
 // Rendered features from the stored ones, per block of `width` numbers: f / (|f| + epsilon), or f
 // where epsilon < 0 (docs/internals/method.md#feature-gauge). Reference:
 // pass::project::features_reference.
+#extension GL_GOOGLE_include_directive : require
 layout(local_size_x = 64) in;
 
 layout(std430, binding = 0) readonly buffer Features { float features[]; };  // [N, dim]
@@ -9,8 +10,10 @@ layout(std430, binding = 0) readonly buffer Features { float features[]; };  // 
 layout(std430, binding = 1) writeonly buffer Codes { float codes[]; };
 layout(push_constant) uniform Push { uint count; uint dim; uint stride; uint width; float epsilon; };
 
+#include "shared/rows.glsl"
+
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = thread_number();
     if (i >= count) return;
     for (uint first = 0; first < dim; first += width) {
         float squares = 0.0;

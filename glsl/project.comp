@@ -27,6 +27,7 @@ layout(push_constant) uniform Push {
 #include "shared/camera.glsl"
 #include "shared/cutoffs.glsl"
 #include "shared/layout.glsl"
+#include "shared/rows.glsl"
 #include "shared/sh.glsl"
 #include "shared/splat.glsl"
 
@@ -47,7 +48,7 @@ uint depth_key(float z) {
 }
 
 void main() {
-    uint i = gl_GlobalInvocationID.x, threads = 64u * gl_NumWorkGroups.x;
+    uint i = thread_number(), threads = 64u * gl_NumWorkGroups.x * gl_NumWorkGroups.y;
     if (i == 0u) splat_count = count;
     for (uint k = i; k < sort_words; k += threads) sort_zeros[k] = 0u;
     for (uint k = i; k < list_words; k += threads) list_zeros[k] = 0u;

@@ -7,9 +7,10 @@ layout(std430, binding = 0) readonly buffer LogScales { float log_scales[]; };  
 layout(std430, binding = 1) buffer Gradients { float gradients[]; };  // [N, 3]
 layout(push_constant) uniform Push { uint count; float weight; float limit; };
 #include "shared/ratio_penalty.glsl"
+#include "shared/rows.glsl"
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = thread_number();
     if (i >= count) return;
     vec3 s = vec3(log_scales[3u * i], log_scales[3u * i + 1u], log_scales[3u * i + 2u]);
     vec3 gradient = ratio_gradient(s, weight, limit);

@@ -11,11 +11,12 @@ layout(std430, binding = 3) buffer Sums { vec2 sums[]; };  // [N] (sum of length
 layout(push_constant) uniform Push { uint count; float half_width; float half_height; };
 
 #include "shared/layout.glsl"
+#include "shared/rows.glsl"
 
 const float TO_CONIC = -2.0 * 0.6931471805599453; // from the coefficients of log2(e^p)
 
 void main() {
-    uint i = gl_GlobalInvocationID.x;
+    uint i = thread_number();
     if (i >= count || guard[1] != 0u) return;
     vec4 head = projected[PROJECTED_VECTORS * i], rest = projected[PROJECTED_VECTORS * i + 1];
     if (rest.y <= -1e3) return; // not visible

@@ -59,7 +59,7 @@ fn record_counting(
         },
         &shaders::bin_count::Push { count, tiles_x, first_row, end_row },
     );
-    rec.dispatch_threads(call, [count, 1, 1]);
+    rec.dispatch(call, rows_of_groups((count as usize).div_ceil(shaders::bin_count::WORKGROUP[0] as usize)));
     scan.record(rec, &lists.counts, splat_count, &lists.starts, &frame.status);
     rec.fill(counters, 0);
     let call = shaders::bin_emit::call(

@@ -10,7 +10,7 @@
 use super::frame::FrameBuffers;
 use super::options::FeatureMode;
 use super::params::Params;
-use super::sort::Sort;
+use super::sort::{Sort, rows_of_groups};
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::shared::splat::{DILATION, SMALLEST_AREA};
@@ -70,7 +70,7 @@ pub(super) fn record(
         },
     );
     // Without splats, one workgroup clears the counters.
-    rec.dispatch_threads(call, [count.max(1), 1, 1]);
+    rec.dispatch(call, rows_of_groups(splats.count.div_ceil(shaders::project::WORKGROUP[0] as usize)));
 }
 
 /// Records the map from stored to rendered features, `frame.codes`. Records nothing without
@@ -90,7 +90,10 @@ pub fn record_features(rec: &mut Recorder, splats: &SplatBuffers, frame: &FrameB
             epsilon: mode.epsilon(),
         },
     );
-    rec.dispatch_threads(call, [count, 1, 1]);
+    rec.dispatch(
+        call,
+        rows_of_groups(splats.count.div_ceil(shaders::features_forward::WORKGROUP[0] as usize)),
+    );
 }
 
 /// Projected splat, f64 reference.

@@ -10,6 +10,7 @@ use super::options::FeatureMode;
 use super::params::{Gradients, Params};
 use super::project::{Geometry, geometry, raw_colour};
 use super::raster_backward::SplatGradient;
+use super::sort::rows_of_groups;
 use super::splat_buffers::SplatBuffers;
 use super::view::View;
 use crate::gpu::shaders::structs::CameraView;
@@ -125,7 +126,10 @@ pub fn record_features(
             epsilon: mode.epsilon(),
         },
     );
-    rec.dispatch_threads(call, [count, 1, 1]);
+    rec.dispatch(
+        call,
+        rows_of_groups(splats.count.div_ceil(shaders::features_backward::WORKGROUP[0] as usize)),
+    );
 }
 
 /// CPU reference: adds the gradients through splat `i`, which must be visible, to `out`.

@@ -1,6 +1,7 @@
 //! Regularisers of the RGB stage (docs/internals/method.md#regularisers): stereo depth, wanted
 //! alpha, and a penalty on needles.
 use super::frame::FrameBuffers;
+use super::sort::rows_of_groups;
 use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Records the gradients by D = Σwz and A of `weight · Σ |D − A·d|/d` over pixels with reference
@@ -87,7 +88,7 @@ pub fn record_ratio(
             limit: penalty.limit,
         },
     );
-    rec.dispatch_threads(call, [count as u32, 1, 1]);
+    rec.dispatch(call, rows_of_groups(count.div_ceil(shaders::ratio_penalty::WORKGROUP[0] as usize)));
 }
 
 /// CPU reference of [`record_ratio`]: (loss, gradient by the log-scales of one splat). The shader

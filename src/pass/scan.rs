@@ -1,4 +1,5 @@
-//! Exclusive prefix sum of `u32`, wrapping on overflow.
+//! Exclusive prefix sum of `u32`. Sums that overflow stay at the largest number, so that a frame
+//! with more tile-list entries than `u32` counts is one that does not fit.
 use crate::Result;
 use crate::gpu::{Buffer, Device, Recorder, shaders};
 
@@ -60,7 +61,7 @@ pub fn exclusive_scan(values: &[u32]) -> (Vec<u32>, u32) {
         .iter()
         .map(|&v| {
             let start = sum;
-            sum = sum.wrapping_add(v);
+            sum = sum.saturating_add(v);
             start
         })
         .collect();
@@ -76,8 +77,10 @@ mod tests {
     fn scan_at_odd_sizes_matches_reference() {
         let device = test_device();
         let scan = Scan::new(&device).unwrap();
-        for n in [0usize, 1, 2, 255, 256, 257, 1000, 70_001] {
-            let values: Vec<u32> = (0..n).map(|i| (i as u32).wrapping_mul(2654435761) >> 20).collect();
+        // Without the shift, sums overflow.
+        let sizes = [0usize, 1, 2, 255, 256, 257, 1000, 70_001];
+        for (n, shift) in sizes.into_iter().flat_map(|n| [(n, 20), (n, 0)]) {
+            let values: Vec<u32> = (0..n).map(|i| (i as u32).wrapping_mul(2654435761) >> shift).collect();
             // One more element than counted, which must not change.
             let buffer = device.buffer_from("values", &[values.as_slice(), &[7]].concat()).unwrap();
             let count = device.buffer_from("count", &[n as u32]).unwrap();
@@ -88,8 +91,8 @@ mod tests {
             rec.run().unwrap();
             let (mut expected, sum) = exclusive_scan(&values);
             expected.push(99);
-            assert_eq!(starts.read().unwrap(), expected, "{n} values");
-            assert_eq!(total.read().unwrap(), [sum], "{n} values");
+            assert_eq!(starts.read().unwrap(), expected, "{n} values >> {shift}");
+            assert_eq!(total.read().unwrap(), [sum], "{n} values >> {shift}");
         }
     }
 }

@@ -7,6 +7,7 @@
 use super::frame::FrameBuffers;
 use super::project::Projected;
 use super::raster_backward::SplatGradient;
+use super::sort::rows_of_groups;
 use crate::gpu::{Buffer, Recorder, shaders};
 
 /// Records the addition of a frame's gradients, after its backward pass, to `sums` [N, 2]: per splat
@@ -25,7 +26,7 @@ pub fn record(rec: &mut Recorder, frame: &FrameBuffers, splats: usize, sums: &Bu
             half_height: 0.5 * frame.height as f32,
         },
     );
-    rec.dispatch_threads(call, [splats as u32, 1, 1]);
+    rec.dispatch(call, rows_of_groups(splats.div_ceil(shaders::screen_gradients::WORKGROUP[0] as usize)));
 }
 
 /// CPU reference: length of the gradient of one splat in an image of `size` pixels.

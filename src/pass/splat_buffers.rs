@@ -1,5 +1,6 @@
 //! Raw splat parameters in GPU memory.
-use crate::gpu::{Buffer, Device};
+use super::frame::PROJECTED_FLOATS;
+use crate::gpu::{Buffer, Device, DeviceInfo};
 use crate::scene::{Splats, sh_coefficients};
 use crate::{Error, Result};
 
@@ -47,6 +48,10 @@ impl SplatBuffers {
         if features.len() != n * feature_dim {
             let given = features.len();
             return Err(Error::work(format!("{given} feature values do not make {n} × {feature_dim}")));
+        }
+        let most = most_splats(device.info(), splats.sh_degree, feature_dim);
+        if n > most {
+            return Err(too_many(device.info(), n, most));
         }
         let mut out = SplatBuffers::zeros(device, "splats", n, splats.sh_degree, feature_dim)?;
         out.antialiased = splats.antialiased;
@@ -112,6 +117,22 @@ impl SplatBuffers {
         };
         Ok((splats, floats(&self.features, n * self.feature_dim)?))
     }
+}
+
+/// Most splats of this SH degree, with d features, that a device renders: its largest buffer over
+/// the widest of a splat's rows, the projected splat among them.
+pub fn most_splats(device: &DeviceInfo, sh_degree: u32, feature_dim: usize) -> usize {
+    let widest = PROJECTED_FLOATS.max(3 * sh_coefficients(sh_degree)).max(feature_dim.next_multiple_of(4));
+    (device.max_buffer / (4 * widest as u64)) as usize
+}
+
+fn too_many(device: &DeviceInfo, splats: usize, most: usize) -> Error {
+    Error::input(format!(
+        "{splats} splats are more than the {most} that {} renders, whose buffers have at most {} MiB: splatvk view shows \
+         those that cover most, splatvk edit --delete \"opacity<0.1\" thins out a scene, another device may hold more",
+        device.name,
+        device.max_buffer >> 20
+    ))
 }
 
 fn triples(values: &[f32]) -> Vec<[f32; 3]> {

@@ -56,6 +56,17 @@ fn byte_len<T>(len: usize) -> u64 {
     (len as u64).saturating_mul(size_of::<T>() as u64)
 }
 
+/// The error of a buffer that exceeds a limit of the device.
+pub(crate) fn too_large(device: &Device, name: &str, bytes: u64, limit: u64) -> Error {
+    let mib = |b: u64| b as f64 / f64::from(1 << 20);
+    Error::TooLarge(format!(
+        "buffer `{name}` needs {:.1} MiB but {} binds at most {:.0} MiB: use fewer splats, smaller photos or another device",
+        mib(bytes),
+        device.info().name,
+        mib(limit)
+    ))
+}
+
 /// Vulkan has no empty buffers, and shaders read whole vectors of four words up to the end.
 fn padded(bytes: u64) -> u64 {
     bytes.max(16).next_multiple_of(16)
@@ -69,15 +80,10 @@ impl<T> Clone for Buffer<T> {
 
 impl<T> Buffer<T> {
     fn create(device: &Device, name: &str, bytes: u64, mapped: bool) -> Result<Self> {
-        let limit = device.info().max_storage_range;
+        let limit = device.info().max_buffer;
         let mib = |b: u64| b as f64 / f64::from(1 << 20);
         if bytes > limit {
-            return Err(Error::refused(format!(
-                "buffer `{name}` needs {:.1} MiB but {} binds at most {:.0} MiB: use fewer splats, smaller photos or another device",
-                mib(bytes),
-                device.info().name,
-                mib(limit)
-            )));
+            return Err(too_large(device, name, bytes, limit));
         }
         let what = format!("buffer `{name}` of {:.1} MiB", mib(bytes));
         let block = device.0.heap.buffer(&device.0.device, name, padded(bytes), mapped, &what)?;

@@ -88,7 +88,8 @@ impl Device {
         sink: Option<Sink>,
         setup: Setup,
     ) -> Result<Device> {
-        let Setup { instance, device, info, queue, queue_family, timeline, queue_lock, owned, .. } = setup;
+        let Setup { instance, device, mut info, queue, queue_family, timeline, queue_lock, owned, .. } =
+            setup;
         let sync2 =
             setup.sync2_extension.then(|| ash::khr::synchronization2::Device::new(&instance, &device));
         // SAFETY: the physical device belongs to the instance.
@@ -119,7 +120,10 @@ impl Device {
             }
         };
         // Native code works on mapped buffers, and is faster where the device is the processor.
-        let on_processor = info.is_cpu && info.mapped;
+        let natives: &[Native] = if info.is_cpu && info.mapped { setup.natives } else { &[] };
+        if natives.is_empty() {
+            info.max_buffer = info.max_storage_range;
+        }
         let messenger = sink.as_ref().and_then(|sink| {
             let debug = ash::ext::debug_utils::Instance::new(&entry, &instance);
             // SAFETY: the sink outlives the messenger (see Drop).
@@ -138,7 +142,7 @@ impl Device {
             submissions: AtomicU64::new(0),
             transfers: Transfers::default(),
             stand_in: None,
-            natives: if on_processor { setup.natives } else { &[] },
+            natives,
             #[cfg(feature = "testing")]
             lost_from: AtomicU64::new(u64::MAX),
             staging: Mutex::default(),

@@ -44,6 +44,9 @@ pub enum Error {
         /// The driver's result.
         source: VulkanError,
     },
+    /// A buffer exceeds a limit of the device, however much memory is free.
+    #[error("{0}")]
+    TooLarge(String),
     /// The driver refused something else, or a recording is wrong.
     #[error("Vulkan: {message}")]
     Refused {

@@ -176,6 +176,7 @@ fn describe(
     let own = |heap: &&vk::MemoryHeap| heap.flags.contains(vk::MemoryHeapFlags::DEVICE_LOCAL);
     let memory = memory.memory_heaps_as_slice().iter().filter(own).map(|heap| heap.size).max().unwrap_or(0);
     let limits = candidate.properties.limits;
+    let most_bound = options.max_binding.unwrap_or(u64::MAX);
     let pins = offer.subgroup_control
         && control.required_subgroup_size_stages.contains(vk::ShaderStageFlags::COMPUTE);
     let size = v11.subgroup_size;
@@ -211,8 +212,8 @@ fn describe(
         disabled: options.disabled.clone(),
         preferred: options.preferred.clone(),
         capabilities: capabilities(offer, &v11, float_atomics),
-        max_storage_range: u64::from(limits.max_storage_buffer_range)
-            .min(options.max_binding.unwrap_or(u64::MAX)),
+        max_storage_range: u64::from(limits.max_storage_buffer_range).min(most_bound),
+        max_buffer: v11.max_memory_allocation_size.min(most_bound),
         memory,
         max_groups: limits.max_compute_work_group_count,
         max_workgroup_threads: limits.max_compute_work_group_invocations,

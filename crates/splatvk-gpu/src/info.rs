@@ -89,6 +89,9 @@ pub struct DeviceInfo {
     pub capabilities: BTreeSet<Capability>,
     /// Largest buffer a shader can see, bytes.
     pub max_storage_range: u64,
+    /// Largest buffer, bytes: more than a shader can see where native code takes the place of
+    /// shaders.
+    pub max_buffer: u64,
     /// Memory of the largest heap that is the device's own, bytes.
     pub memory: u64,
     /// Largest dispatch, in workgroups.

@@ -1,6 +1,6 @@
 //! A compiled recording: command buffers that can be submitted again and again.
 use crate::barrier;
-use crate::buffer::Buffer;
+use crate::buffer::{Buffer, too_large};
 use crate::call::Call;
 use crate::command::{self, Command, Groups, Op};
 use crate::device::Device;
@@ -313,6 +313,10 @@ impl Program {
             let (_, buffer) = call.buffers.iter().find(|(n, _)| *n == binding.number).ok_or_else(|| {
                 Error::refused(format!("{}: {} misses `{}`", self.label, module.name, binding.name))
             })?;
+            let limit = self.device.info().max_storage_range;
+            if buffer.bytes() > limit {
+                return Err(too_large(&self.device, buffer.name(), buffer.bytes(), limit));
+            }
             buffers
                 .push([vk::DescriptorBufferInfo::default().buffer(buffer.raw()).range(buffer.raw_bytes())]);
         }

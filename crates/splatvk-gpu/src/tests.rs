@@ -124,7 +124,7 @@ fn buffers_check_their_bounds_and_sizes() {
     assert!(buffer.write_at(4, &[1u8, 2]).is_err());
     assert!(buffer.read_range(4..6).is_err());
     assert!(device.buffer::<f32>("empty", 0).unwrap().read().unwrap().is_empty());
-    let too_long = device.info().max_storage_range as usize + 1;
+    let too_long = device.info().max_buffer as usize + 1;
     let message = device.buffer::<u8>("huge", too_long).unwrap_err().to_string();
     assert!(message.contains("huge") && message.contains("MiB"), "{message}");
 }

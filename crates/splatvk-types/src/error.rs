@@ -194,7 +194,7 @@ impl From<splatvk_gpu::Error> for Error {
         use splatvk_gpu::Error as Gpu;
         match error {
             Gpu::NoDevice { message, source } => Error::NoDevice { message, source },
-            Gpu::Choice(message) | Gpu::Host(message) => Error::Input(message),
+            Gpu::Choice(message) | Gpu::Host(message) | Gpu::TooLarge(message) => Error::Input(message),
             Gpu::NoValidationLayer(message) => Error::Missing(message),
             Gpu::DeviceLost { doing, source } => {
                 Error::DeviceLost { doing, kept: None, source: Box::new(source) }

@@ -75,16 +75,18 @@ pub(super) fn scan_sums(call: &mut NativeCall) -> Result<(), String> {
     let [values, count, sums] = call.memory([0, 1, 2])?;
     let (values, count): (&[u32], usize) = (values.of(), count.of::<u32>()[0] as usize);
     let sums = sums.of::<u32>()[..lanes].par_iter_mut().with_min_len(64).enumerate();
-    sums.for_each(|(lane, sum)| *sum = values[chunk(lane, lanes, count)].iter().sum());
+    sums.for_each(|(lane, sum)| {
+        *sum = values[chunk(lane, lanes, count)].iter().fold(0, |sum, v| v.saturating_add(sum))
+    });
     Ok(())
 }
 
 pub(super) fn scan_lanes(call: &mut NativeCall) -> Result<(), String> {
     let [lanes] = call.words()?.map(|word| word as usize);
     let [sums, total] = call.memory([0, 1])?;
-    let mut start = 0;
+    let mut start = 0u32;
     for sum in &mut sums.of::<u32>()[..lanes] {
-        (*sum, start) = (start, start + *sum);
+        (*sum, start) = (start, start.saturating_add(*sum));
     }
     total.of::<u32>()[0] = start;
     Ok(())
@@ -100,7 +102,7 @@ pub(super) fn scan_apply(call: &mut NativeCall) -> Result<(), String> {
     starts.for_each(|(lane, starts)| {
         let mut start = sums[lane];
         for (place, value) in starts.iter_mut().zip(&values[lane * each..]) {
-            (*place, start) = (start, start + value);
+            (*place, start) = (start, start.saturating_add(*value));
         }
     });
     Ok(())
