@@ -7,7 +7,8 @@ layout(std430, binding = 0) readonly buffer Projected { vec4 projected[]; };  //
 // [N] (key, splat), sorted.
 layout(std430, binding = 1) readonly buffer DepthPairs { uvec2 depth_pairs[]; };
 layout(std430, binding = 2) writeonly buffer TileCounts { uint tile_counts[]; };  // [N]
-layout(push_constant) uniform Push { uint count; uint tiles_x; uint first_row; uint end_row; };
+layout(std430, binding = 3) readonly buffer SplatCount { uint count; };  // visible splats
+layout(push_constant) uniform Push { uint tiles_x; uint first_row; uint end_row; };
 
 #include "shared/tiles.glsl"
 #include "shared/rows.glsl"

@@ -23,8 +23,9 @@ layout(std430, binding = 5) writeonly buffer Entries { uvec2 entries[]; };  // [
 layout(std430, binding = 6) buffer Counters { uint counters[]; };  // [tiles, lanes]
 // [lanes] first entry.
 layout(std430, binding = 7) writeonly buffer LaneStarts { uint lane_starts[]; };
+layout(std430, binding = 8) readonly buffer SplatCount { uint count; };  // visible splats
 layout(push_constant) uniform Push {
-    uint count; uint tiles_x; uint first_row; uint end_row; uint lanes; uint capacity;
+    uint tiles_x; uint first_row; uint end_row; uint lanes; uint capacity;
 };
 
 #include "shared/tiles.glsl"

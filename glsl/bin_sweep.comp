@@ -41,8 +41,9 @@ layout(std430, binding = 7) writeonly buffer EntrySplats { uint entry_splats[]; 
 layout(std430, binding = 8) writeonly buffer TileCounts { uint tile_counts[]; };
 layout(std430, binding = 9) writeonly buffer Starts { uint starts[]; };
 #endif
+layout(std430, binding = 10) readonly buffer SplatCount { uint count; };  // visible splats
 layout(push_constant) uniform Push {
-    uint count; uint tiles_x; uint first_row; uint end_row; uint capacity; uint first_digit; uint passes;
+    uint tiles_x; uint first_row; uint end_row; uint capacity; uint first_digit; uint passes;
 };
 
 #include "shared/ballot.glsl"

@@ -17,7 +17,7 @@ layout(std430, binding = 5) readonly buffer Sh { float sh[]; };  // [N, sh_strid
 layout(std430, binding = 6) writeonly buffer Projected { vec4 projected[]; };
 // [N] (sort key, splat).
 layout(std430, binding = 7) writeonly buffer DepthPairs { uvec2 depth_pairs[]; };
-layout(std430, binding = 8) writeonly buffer SplatCount { uint splat_count; };     // N
+layout(std430, binding = 8) writeonly buffer SplatCount { uint splat_count[]; };   // N, N
 layout(std430, binding = 9) writeonly buffer SortZeros { uint sort_zeros[]; };     // [sort_words]
 layout(std430, binding = 10) writeonly buffer ListZeros { uint list_zeros[]; };    // [list_words]
 layout(push_constant) uniform Push {
@@ -40,6 +40,16 @@ const uint HIDDEN_KEY = 16777215; // behind all others
 const uint FINE_FIRST = 998244352, FINE_END = 1199570944; // bits of 1/256 and 65536
 const uint FINE_DROPPED = 4, COARSE_DROPPED = 9;
 
+// Whether the ellipse of a splat, where o e^p reaches the threshold, may lie on a tile of the
+// image. `power` is (A', B', C'), `det` A'C' - B'^2/4.
+bool is_on_image(vec2 centre, vec3 power, float det, float log2_opacity) {
+    float k = (log2_opacity - LOG2_ALPHA_MIN) / det;
+    vec2 reach = 1.001 * sqrt(max(-k * power.zx, vec2(0.0))) + 1.0;
+    vec2 far = ceil(camera_size() / float(TILE)) * float(TILE) - 1.0;
+    // Numbers that are not finite stay.
+    return !(any(lessThan(centre + reach, vec2(0.0))) || any(greaterThan(centre - reach, far)));
+}
+
 uint depth_key(float z) {
     uint bits = floatBitsToUint(z);
     uint below = min(bits, FINE_FIRST), above = max(bits, FINE_END) - FINE_END;
@@ -49,7 +59,7 @@ uint depth_key(float z) {
 
 void main() {
     uint i = thread_number(), threads = 64u * gl_NumWorkGroups.x * gl_NumWorkGroups.y;
-    if (i == 0u) splat_count = count;
+    if (i == 0u) splat_count[0] = splat_count[1] = count;
     for (uint k = i; k < sort_words; k += threads) sort_zeros[k] = 0u;
     for (uint k = i; k < list_words; k += threads) list_zeros[k] = 0u;
     if (i >= count) return;
@@ -69,12 +79,13 @@ void main() {
     }
     colour = max(colour, vec3(0.0));
 
-    bool visible = g.visible && log2_opacity >= LOG2_ALPHA_MIN;
     vec2 centre = camera_focal() * g.t.xy / g.t.z + camera_centre() - 0.5;
     vec3 power = vec3(-0.5 * LOG2_E, -LOG2_E, -0.5 * LOG2_E) * g.conic;
+    float det = 0.25 * LOG2_E * LOG2_E * g.conic_det;
+    bool visible = g.visible && log2_opacity >= LOG2_ALPHA_MIN && is_on_image(centre, power, det, log2_opacity);
     // A log opacity of -1e4 makes an invisible splat fail every later comparison.
     projected[PROJECTED_VECTORS * i] = vec4(centre, power.xy);
-    projected[PROJECTED_VECTORS * i + 1] = vec4(power.z, visible ? log2_opacity : -1e4, 0.25 * LOG2_E * LOG2_E * g.conic_det, 0.0);
+    projected[PROJECTED_VECTORS * i + 1] = vec4(power.z, visible ? log2_opacity : -1e4, det, 0.0);
     projected[PROJECTED_VECTORS * i + 2] = vec4(colour, g.t.z);
     depth_pairs[i] = uvec2(visible ? depth_key(g.t.z) : HIDDEN_KEY, i);
 }

@@ -20,8 +20,8 @@ const LARGE_GROUPS: u32 = 512;
 /// Places of the lists per thread: more would wait for memory one after the other.
 const RANGES_PER_THREAD: u32 = 4;
 
-/// Records counting, writing and grouping of the entries of `count` depth-sorted splats on these
-/// rows of tiles; `splat_count` holds the same number on the device. Writes the lists to
+/// Records counting, writing and grouping of the entries of up to `count` depth-sorted splats on
+/// these rows of tiles; `splat_count` holds their number. Writes the lists to
 /// `frame.lists`, the number of entries needed to `frame.status`.
 pub(super) fn record(
     rec: &mut Recorder,
@@ -37,7 +37,7 @@ pub(super) fn record(
             if state == Lists::Used {
                 rec.fill(lists.zeros().0, 0);
             }
-            record_sorting(rec, frame, rows, count, group);
+            record_sorting(rec, frame, rows, (count, splat_count), group);
         }
     }
 }
@@ -56,8 +56,9 @@ fn record_counting(
             projected: &frame.projected,
             depth_pairs: &frame.depth_pairs,
             tile_counts: &lists.counts,
+            splat_count,
         },
-        &shaders::bin_count::Push { count, tiles_x, first_row, end_row },
+        &shaders::bin_count::Push { tiles_x, first_row, end_row },
     );
     rec.dispatch(call, rows_of_groups((count as usize).div_ceil(shaders::bin_count::WORKGROUP[0] as usize)));
     scan.record(rec, &lists.counts, splat_count, &lists.starts, &frame.status);
@@ -72,15 +73,9 @@ fn record_counting(
             entries: &lists.entries,
             counters,
             lane_starts,
+            splat_count,
         },
-        &shaders::bin_emit::Push {
-            count,
-            tiles_x,
-            first_row,
-            end_row,
-            lanes,
-            capacity: lists.capacity as u32,
-        },
+        &shaders::bin_emit::Push { tiles_x, first_row, end_row, lanes, capacity: lists.capacity as u32 },
     );
     rec.dispatch_threads(call, [lanes, 1, 1]);
     group_by_counting(rec, frame, tiles, (counters, lane_starts), lanes);
@@ -124,7 +119,13 @@ fn group_by_counting(
 }
 
 /// Records one sweep over the splats that writes their entries, the sort, and the lists.
-fn record_sorting(rec: &mut Recorder, frame: &FrameBuffers, rows: &Range<u32>, count: u32, group: &Sorting) {
+fn record_sorting(
+    rec: &mut Recorder,
+    frame: &FrameBuffers,
+    rows: &Range<u32>,
+    (count, splat_count): (u32, &Buffer<u32>),
+    group: &Sorting,
+) {
     let (tiles_x, lists) = (frame.tiles()[0], &frame.lists);
     let (first_row, end_row, tiles) = (rows.start, rows.end, tiles_x * (rows.end - rows.start));
     let capacity = lists.capacity as u32;
@@ -148,8 +149,9 @@ fn record_sorting(rec: &mut Recorder, frame: &FrameBuffers, rows: &Range<u32>, c
             entry_splats,
             tile_counts: &lists.counts,
             starts: &lists.starts,
+            splat_count,
         },
-        &shaders::bin_sweep::Push { count, tiles_x, first_row, end_row, capacity, first_digit, passes },
+        &shaders::bin_sweep::Push { tiles_x, first_row, end_row, capacity, first_digit, passes },
     );
     // At least one workgroup, which writes the number of entries.
     rec.dispatch(call, rows_of_groups((count as usize).div_ceil(CHUNK_SPLATS)));

@@ -87,7 +87,7 @@ pub struct Rasterizer {
     /// Most rows of tiles that are binned at once.
     strip: u32,
     sort: Sort,
-    /// [1] u32: N, read by the sort.
+    /// Number of visible splats, and of all.
     count: Buffer<u32>,
 }
 
@@ -177,7 +177,7 @@ impl Rasterizer {
             projection_groups: choices.projection_groups,
             strip: u32::MAX,
             sort: Sort::new(device, splats)?,
-            count: device.buffer::<u32>("splat count", 1)?,
+            count: device.buffer::<u32>("splat count", 2)?,
         })
     }
 
@@ -265,8 +265,13 @@ impl Rasterizer {
         project::record_features(rec, params, &self.frame, options.feature_mode);
         rec.pass("depth sort");
         // The sort is stable: equal keys keep the order of the splats.
+        let moves = match self.frame.summation {
+            GradientReduction::Atomics => Moves::Visible,
+            // The sums per entry overwrite the gradients of all splats.
+            GradientReduction::Entries => Moves::All,
+        };
         let pairs = &self.frame.depth_pairs;
-        self.sort.record_prepared(rec, pairs, (&self.count, Moves::All), DEPTH_BITS, Prepared::Cleared);
+        self.sort.record_prepared(rec, pairs, (&self.count, moves), DEPTH_BITS, Prepared::Cleared);
     }
 
     /// Records binning and blending of a band. In a recording, band 0 directly follows

@@ -165,9 +165,10 @@ fn count_all<S: Simd>(
 }
 
 pub(super) fn count(call: &mut NativeCall) -> Result<(), String> {
-    let [count, columns, first_row, end_row] = call.words()?;
+    let [columns, first_row, end_row] = call.words()?;
     let grid = Grid { columns, first_row, end_row };
-    let [projected, pairs, counts] = call.memory([0, 1, 2])?;
+    let [projected, pairs, counts, count] = call.memory([0, 1, 2, 3])?;
+    let count = count.of::<u32>()[0];
     let (projected, pairs): (&[[f32; FLOATS]], &[[u32; 2]]) = (projected.of(), pairs.of());
     let counts = counts.of::<u32>()[..count as usize].par_chunks_mut(1024);
     let level = Level::new();
@@ -178,11 +179,11 @@ pub(super) fn count(call: &mut NativeCall) -> Result<(), String> {
 }
 
 pub(super) fn emit(call: &mut NativeCall) -> Result<(), String> {
-    let [count, columns, first_row, end_row, lanes, capacity] = call.words()?;
+    let [columns, first_row, end_row, lanes, capacity] = call.words()?;
     let grid = Grid { columns, first_row, end_row };
-    let (count, lanes) = (count as usize, lanes as usize);
-    let [projected, pairs, starts, status, entry_count, entries, counters, lane_starts] =
-        call.memory([0, 1, 2, 3, 4, 5, 6, 7])?;
+    let [projected, pairs, starts, status, entry_count, entries, counters, lane_starts, count] =
+        call.memory([0, 1, 2, 3, 4, 5, 6, 7, 8])?;
+    let (count, lanes) = (count.of::<u32>()[0] as usize, lanes as usize);
     let (projected, pairs): (&[[f32; FLOATS]], &[[u32; 2]]) = (projected.of(), pairs.of());
     let (starts, status): (&[u32], _) = (&starts.of::<u32>()[..count], status.of::<u32>());
     let total = status[0];

@@ -6,7 +6,7 @@ use crate::gpu::shaders::shared::cutoffs::LOG2_ALPHA_MIN;
 use crate::gpu::shaders::shared::layout::PROJECTED_FLOATS;
 use crate::gpu::shaders::structs::CameraView;
 use crate::scene::{SH_C0, sh};
-use glam::{Vec3, Vec4};
+use glam::{Vec2, Vec3, Vec4};
 use rayon::prelude::*;
 use std::f32::consts::LOG2_E;
 
@@ -24,7 +24,7 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
     let degree = call.variant()[0];
     let [camera, means, log_scales, quats, opacity_logits, sh, projected, pairs, splats, sort, list] =
         call.memory([0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10])?;
-    splats.of::<u32>()[0] = count as u32;
+    splats.of::<u32>()[..2].fill(count as u32);
     sort.of::<u32>()[..sort_words].fill(0);
     list.of::<u32>()[..list_words].fill(0);
     let camera = Camera::new(&camera.of::<CameraView>()[0]);
@@ -49,9 +49,13 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
             }
         }
         let colour = colour.max(Vec3::ZERO);
-        let visible = g.visible && log2_opacity >= LOG2_ALPHA_MIN as f32;
         let centre = camera.focal * g.t.truncate() / g.t.z + camera.centre - 0.5;
         let power = Vec3::new(-0.5 * LOG2_E, -LOG2_E, -0.5 * LOG2_E) * g.conic;
+        let det = 0.25 * LOG2_E * LOG2_E * g.conic_det;
+        let k = (log2_opacity - LOG2_ALPHA_MIN as f32) / det;
+        let reach = 1.001 * Vec2::new((-k * power.z).max(0.0).sqrt(), (-k * power.x).max(0.0).sqrt()) + 1.0;
+        let is_outside = (centre + reach).cmplt(Vec2::ZERO).any() || (centre - reach).cmpgt(camera.far).any();
+        let visible = g.visible && log2_opacity >= LOG2_ALPHA_MIN as f32 && !is_outside;
         *out = [
             centre.x,
             centre.y,
@@ -59,7 +63,7 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
             power.y,
             power.z,
             if visible { log2_opacity } else { -1e4 },
-            0.25 * LOG2_E * LOG2_E * g.conic_det,
+            det,
             0.0,
             colour.x,
             colour.y,

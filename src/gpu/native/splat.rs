@@ -1,4 +1,5 @@
 //! Screen-space geometry of a splat in f32, as `glsl/shared/splat.glsl`, for the native passes.
+use crate::gpu::shaders::shared::layout::TILE;
 use crate::gpu::shaders::shared::splat::{DILATION, SMALLEST_AREA};
 use crate::gpu::shaders::structs::CameraView;
 use glam::{Mat3, Quat, Vec2, Vec3, Vec4};
@@ -12,6 +13,8 @@ pub(super) struct Camera {
     pub focal: Vec2,
     pub centre: Vec2,
     size: Vec2,
+    /// Index of the last pixel of the last tile.
+    pub far: Vec2,
     near: f32,
 }
 
@@ -26,6 +29,7 @@ impl Camera {
             focal: view.focal.into(),
             centre: view.centre.into(),
             size: view.size.into(),
+            far: (Vec2::from(view.size) / TILE as f32).ceil() * TILE as f32 - 1.0,
             near: view.near,
         };
         camera.position = -camera.to_world(translation);
