@@ -116,6 +116,11 @@ fn bench_measures_sort_and_growth() {
     let growth = bench.report.section("growth").unwrap();
     let pairs = |n: usize| growth.value(&format!("intersections, {n} splats")).unwrap();
     assert!(growth.rows.len() == 2 && pairs(400) > pairs(100));
+    let visible = growth.value("visible splats, 400 splats").unwrap();
+    assert!(visible > 100.0 && visible <= 400.0, "{visible}");
+    let exponent = |of: &str| growth.value(&format!("exponent in {of}, 100 to 400 splats")).unwrap();
+    let growth_of_load = pairs(400).max(visible) / pairs(100);
+    assert!((exponent("load") * growth_of_load.ln() - exponent("splats") * 4f64.ln()).abs() < 1e-9);
 }
 
 #[test]

@@ -38,6 +38,17 @@ pub fn count(device: &Device, raster: &Rasterizer) -> Result<Pairs> {
     Ok(Pairs { evaluated: sum(0), blended: sum(1), in_rows: sum(2) })
 }
 
+/// Number of the first `splats` that the last forward pass sorted as visible: in front of the near
+/// plane, within the image and its border, and not too faint.
+pub fn visible(raster: &Rasterizer, splats: usize) -> Result<usize> {
+    let mut hidden = 0;
+    raster.frame().depth_pairs.read_with(0..2 * splats, &mut |first, words| {
+        let keys = words.iter().skip(first % 2).step_by(2);
+        hidden += keys.filter(|key| **key == shaders::project::HIDDEN_KEY).count();
+    })?;
+    Ok(splats - hidden)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -75,6 +86,7 @@ mod tests {
             pairs += list.len();
             rows.extend(list.iter().map(|pair| (pair.splat, x / TILE, y)));
         }
+        assert_eq!(visible(&raster, 600).unwrap(), forward.projected.iter().flatten().count());
         // f32 and f64 may disagree at the two thresholds for a pair in ten thousand.
         let is_near = |a: f64, b: usize| (a - b as f64).abs() <= 1e-3 * b as f64;
         assert!(is_near(blended, pairs), "{blended} of {pairs}");
