@@ -52,9 +52,9 @@ pub static ALL: &[Native] = &[
     Native { family: "sort_count", run: sort::count },
     Native { family: "sort_offsets", run: sort::offsets },
     Native { family: "sort_scatter", run: sort::scatter },
-    Native { family: "ssim_columns", run: ssim::columns },
-    Native { family: "ssim_rows", run: ssim::rows },
-    Native { family: "ssim_rows_shared", run: ssim::rows },
+    Native { family: "ssim_columns", run: ssim::nothing },
+    Native { family: "ssim_rows", run: ssim::nothing },
+    Native { family: "ssim_rows_shared", run: ssim::nothing },
     Native { family: "ssim_gradient", run: ssim::gradient },
     Native { family: "sum", run: small::sum },
 ];

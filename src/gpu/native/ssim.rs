@@ -1,7 +1,6 @@
-//! `ssim_columns.comp`, `ssim_rows.comp` (or `ssim_rows_shared.comp`) and `ssim_gradient.comp`.
-//! Only these passes read their scratch buffers. Here these hold a plane per quantity instead of
-//! pairs, so that rows of a plane are vectors.
-use super::small::sign;
+//! `ssim_columns.comp`, `ssim_rows.comp` (or `ssim_rows_shared.comp`) and `ssim_gradient.comp` in
+//! one sweep over the rows of an image. The last of these commands does the work of all, since only
+//! they read their scratch buffers: blurred rows stay in the cache.
 use crate::gpu::NativeCall;
 use crate::gpu::shaders::shared::ssim::{C1, C2, HALF, STRIP, WINDOW};
 use fearless_simd::{Level, Simd, dispatch, f32x8, prelude::*};
@@ -9,16 +8,42 @@ use rayon::prelude::*;
 use std::ops::Range;
 
 const REACH: usize = HALF as usize;
+/// Rows and columns of one sum.
 const ROWS: usize = STRIP as usize;
 const TAPS: usize = WINDOW.len();
 const LANES: usize = 8;
-/// Rows that the outputs of a strip read.
-const READ: usize = ROWS + 2 * REACH;
-/// Columns that are blurred together: with four planes they fit the first-level cache.
-const BLOCK: usize = 64;
+/// Rows of a step of the sweep: each row that their windows share is loaded once for all.
+const STEP: usize = 4;
+/// Rows that the windows of a step read.
+const READ: usize = STEP + TAPS - 1;
+/// Rows of a plane that are kept.
+const KEPT: usize = 4 * STEP;
+/// Steps after that of a row until the windows that begin with it are complete.
+const LAG: usize = 3;
+/// Zeros before and behind a row: the window of a pixel beside the border reads them.
+const MARGIN: usize = LANES;
 
-/// Rows of a plane that a strip reads, in a block of columns.
-type Rows = [[f32; BLOCK]; READ];
+const _: () = assert!(TAPS == 2 * REACH + 1 && READ <= KEPT && KEPT == (LAG + 1) * STEP && REACH <= MARGIN);
+
+/// Eight numbers, of which those beyond `from` are 0.
+#[inline(always)]
+fn load<S: Simd>(simd: S, from: &[f32]) -> f32x8<S> {
+    let Some(whole) = from.first_chunk::<LANES>() else {
+        let mut eight = [0.0; LANES];
+        eight[..from.len()].copy_from_slice(from);
+        return f32x8::from_slice(simd, &eight);
+    };
+    f32x8::from_slice(simd, whole)
+}
+
+/// Writes those of eight numbers that lie in `to`.
+#[inline(always)]
+fn store<S: Simd>(eight: f32x8<S>, to: &mut [f32]) {
+    match to.first_chunk_mut::<LANES>() {
+        Some(whole) => eight.store_array(whole),
+        None => to.copy_from_slice(&eight.to_array()[..to.len()]),
+    }
+}
 
 /// The weighted sum of eleven vectors.
 #[inline(always)]
@@ -31,159 +56,25 @@ fn blur<S: Simd>(simd: S, tap: impl Fn(usize) -> f32x8<S>) -> f32x8<S> {
     sum
 }
 
-/// Reads the numbers of a block of columns, of which those beyond `from` are 0.
+/// Vertical blurs of the eight columns at `at`, in the rows of a step.
 #[inline(always)]
-fn read<S: Simd>(simd: S, from: &[f32], block: &mut [f32; BLOCK]) {
-    // A whole block is copied in registers: a call of memmove takes longer.
-    let Some(from) = from.first_chunk::<BLOCK>() else {
-        block[..from.len()].copy_from_slice(from);
-        return block[from.len()..].fill(0.0);
-    };
-    for (from, to) in from.chunks_exact(LANES).zip(block.chunks_exact_mut(LANES)) {
-        f32x8::from_slice(simd, from).store_slice(to);
+fn blur_columns<S: Simd>(simd: S, rows: &[&[f32]; READ], at: usize) -> [f32x8<S>; STEP] {
+    let zero = f32x8::simd_from(simd, 0.0);
+    let (mut taps, mut sums) = ([zero; READ], [zero; STEP]);
+    for (tap, row) in taps.iter_mut().zip(rows) {
+        *tap = f32x8::from_slice(simd, &row[at..at + LANES]);
     }
+    for (k, sum) in sums.iter_mut().enumerate() {
+        *sum = blur(simd, |tap| taps[k + tap]);
+    }
+    sums
 }
 
-/// Writes the numbers of a block of columns that lie in `to`.
+/// Horizontal blurs of the eight columns at `at` of a row with its margin.
 #[inline(always)]
-fn write<S: Simd>(simd: S, block: &[f32; BLOCK], to: &mut [f32]) {
-    let Some(to) = to.first_chunk_mut::<BLOCK>() else {
-        return to.copy_from_slice(&block[..to.len()]);
-    };
-    for (from, to) in block.chunks_exact(LANES).zip(to.chunks_exact_mut(LANES)) {
-        f32x8::from_slice(simd, from).store_slice(to);
-    }
-}
-
-/// Row `k` of the vertical blur of a plane.
-#[inline(always)]
-fn blur_columns<S: Simd>(simd: S, rows: &Rows, k: usize, out: &mut [f32; BLOCK]) {
-    // One check of bounds instead of one per number.
-    let Some(rows) = rows[k..].first_chunk::<TAPS>() else { return };
-    for (block, out) in out.chunks_exact_mut(LANES).enumerate() {
-        let at = block * LANES;
-        blur(simd, |tap| f32x8::from_slice(simd, &rows[tap][at..at + LANES])).store_slice(out);
-    }
-}
-
-/// Horizontal blur of a row that begins [`REACH`] before the first output.
-#[inline(always)]
-fn blur_row<S: Simd>(simd: S, row: &[f32], out: &mut [f32]) {
-    for (block, out) in out.chunks_exact_mut(LANES).enumerate() {
-        let Some(row) = row[block * LANES..].first_chunk::<{ LANES + TAPS - 1 }>() else { return };
-        blur(simd, |tap| f32x8::from_slice(simd, &row[tap..tap + LANES])).store_slice(out);
-    }
-}
-
-/// The strips of an image, and their blocks of columns.
-struct Strips {
-    width: usize,
-    height: usize,
-}
-
-impl Strips {
-    /// Places of the rows that a strip reads in a block of columns that begins at `x`; `None` for
-    /// those outside of the image.
-    fn rows(&self, strip: usize, x: usize) -> impl Iterator<Item = Option<Range<usize>>> {
-        let (width, height) = (self.width, self.height);
-        (0..READ).map(move |i| {
-            let y = (strip * ROWS + i).checked_sub(REACH).filter(|y| *y < height)?;
-            Some(y * width + x..y * width + (x + BLOCK).min(width))
-        })
-    }
-
-    fn blocks(&self) -> impl Iterator<Item = usize> + use<> {
-        (0..self.width).step_by(BLOCK)
-    }
-}
-
-/// Planes of `count` numbers at the start of a buffer.
-fn planes<const N: usize>(numbers: &mut [f32], count: usize) -> [&mut [f32]; N] {
-    let mut planes = numbers.chunks_exact_mut(count);
-    std::array::from_fn(|_| planes.next().unwrap_or_default())
-}
-
-/// Two images of one channel, and the weights of their pixels.
-#[derive(Clone, Copy)]
-struct Images<'a> {
-    x: &'a [f32],
-    y: &'a [f32],
-    weights: Option<&'a [f32]>,
-}
-
-impl<'a> Images<'a> {
-    fn of(
-        rendered: &'a [f32],
-        target: &'a [f32],
-        plane: usize,
-        channel: usize,
-        weighted: bool,
-    ) -> Images<'a> {
-        let own = channel * plane..(channel + 1) * plane;
-        let weights = weighted.then(|| &target[3 * plane..4 * plane]);
-        Images { x: &rendered[own.clone()], y: &target[own], weights }
-    }
-
-    /// Values of the pixels of `at` in both; a pixel of weight 0 has that of the target.
-    #[inline(always)]
-    fn values<S: Simd>(&self, simd: S, at: Range<usize>, x: &mut [f32; BLOCK], y: &mut [f32; BLOCK]) {
-        read(simd, &self.x[at.clone()], x);
-        read(simd, &self.y[at.clone()], y);
-        if let Some(weights) = self.weights {
-            x.iter_mut().zip(&*y).zip(&weights[at]).for_each(|((x, y), w)| *x = w * (*x - y) + y);
-        }
-    }
-}
-
-/// Vertical blurs of x, y, x² + y² and xy.
-pub(super) fn columns(call: &mut NativeCall) -> Result<(), String> {
-    let [width, height, weighted] = call.words()?.map(|word| word as usize);
-    let [rendered, target, means, moments] = call.memory([0, 1, 2, 3])?;
-    let (rendered, target): (&[f32], &[f32]) = (rendered.of(), target.of());
-    let (plane, level) = (width * height, Level::new());
-    let [x, y] = planes(means.of(), 3 * plane);
-    let [squares, products] = planes(moments.of(), 3 * plane);
-    let channels = x.par_chunks_mut(plane).zip(y.par_chunks_mut(plane));
-    let channels = channels.zip(squares.par_chunks_mut(plane)).zip(products.par_chunks_mut(plane));
-    channels.enumerate().for_each(|(channel, (((x, y), squares), products))| {
-        let images = Images::of(rendered, target, plane, channel, weighted != 0);
-        let strips = x.par_chunks_mut(ROWS * width).zip(y.par_chunks_mut(ROWS * width));
-        let strips = strips.zip(squares.par_chunks_mut(ROWS * width));
-        let strips = strips.zip(products.par_chunks_mut(ROWS * width));
-        strips.enumerate().for_each(|(strip, (((x, y), squares), products))| {
-            let image = Strips { width, height };
-            dispatch!(level, simd => strip_columns(simd, &image, strip, &images, [x, y, squares, products]));
-        });
-    });
-    Ok(())
-}
-
-#[inline(always)]
-fn strip_columns<S: Simd>(simd: S, image: &Strips, strip: usize, images: &Images, mut out: [&mut [f32]; 4]) {
-    let mut rows = [[[0.0; BLOCK]; READ]; 4];
-    for first in image.blocks() {
-        let columns = BLOCK.min(image.width - first);
-        for (i, at) in image.rows(strip, first).enumerate() {
-            let [x, y, squares, products] = rows.each_mut().map(|rows| &mut rows[i]);
-            match at {
-                Some(at) => images.values(simd, at, x, y),
-                None => [&mut *x, &mut *y].into_iter().for_each(|row| row.fill(0.0)),
-            }
-            for k in (0..BLOCK).step_by(LANES) {
-                let [u, v] = [&*x, &*y].map(|row| f32x8::from_slice(simd, &row[k..k + LANES]));
-                u.mul_add(u, v * v).store_slice(&mut squares[k..k + LANES]);
-                (u * v).store_slice(&mut products[k..k + LANES]);
-            }
-        }
-        for k in 0..out[0].len() / image.width {
-            let at = k * image.width + first;
-            for (rows, out) in rows.iter().zip(&mut out) {
-                let mut blurred = [0.0; BLOCK];
-                blur_columns(simd, rows, k, &mut blurred);
-                write(simd, &blurred, &mut out[at..at + columns]);
-            }
-        }
-    }
+fn blur_row<S: Simd>(simd: S, row: &[f32], at: usize) -> f32x8<S> {
+    let row = &row[MARGIN - REACH + at..][..LANES + TAPS - 1];
+    blur(simd, |tap| f32x8::from_slice(simd, &row[tap..tap + LANES]))
 }
 
 /// SSIM and its derivatives by (E[x], E[x²], E[xy]), from blurred x, y, x² + y² and xy.
@@ -200,176 +91,279 @@ fn ssim_of<S: Simd>([x, y, squares, products]: [f32x8<S>; 4]) -> [f32x8<S>; 4] {
     [by_mean, -(s * b1 * inverse), a1 * inverse * 2.0, s]
 }
 
-/// Memory of one row of [`rows`].
-struct RowScratch {
-    /// The four inputs, then the three derivatives, with a margin of zeros.
-    wide: [Vec<f32>; 4],
-    blurred: [Vec<f32>; 4],
+/// The last rows of a plane.
+struct Ring {
+    numbers: Vec<f32>,
+    stride: usize,
 }
 
-impl RowScratch {
-    fn new(width: usize) -> RowScratch {
-        let stride = width.next_multiple_of(LANES);
-        let planes = |length: usize| std::array::from_fn(|_| vec![0.0; length]);
-        RowScratch { wide: planes(stride + TAPS - 1), blurred: planes(stride) }
+impl Ring {
+    fn new(stride: usize) -> Ring {
+        Ring { numbers: vec![0.0; KEPT * stride], stride }
     }
 
-    /// Leaves the blurred derivatives in the first planes of `blurred`, and SSIM in `wide[3]`.
     #[inline(always)]
-    fn compute<S: Simd>(&mut self, simd: S, width: usize) {
-        for (wide, blurred) in self.wide.iter().zip(&mut self.blurred) {
-            blur_row(simd, wide, blurred);
-        }
-        for at in (0..width).step_by(LANES) {
-            let blurred = self.blurred.each_ref().map(|row| f32x8::from_slice(simd, &row[at..at + LANES]));
-            for (wide, value) in self.wide.iter_mut().zip(ssim_of(blurred)) {
-                value.store_slice(&mut wide[REACH + at..REACH + at + LANES]);
-            }
-        }
-        for (wide, blurred) in self.wide.iter_mut().zip(&mut self.blurred).take(3) {
-            // Columns outside of the image have no SSIM.
-            wide[REACH + width..].fill(0.0);
-            blur_row(simd, wide, blurred);
+    fn row(&mut self, row: usize) -> &mut [f32] {
+        &mut self.numbers[row % KEPT * self.stride..][..self.stride]
+    }
+
+    /// The rows that the windows of step `step` read.
+    #[inline(always)]
+    fn window(&self, step: usize) -> [&[f32]; READ] {
+        let row = |i: usize| &self.numbers[(step * STEP + i) % KEPT * self.stride..][..self.stride];
+        std::array::from_fn(row)
+    }
+}
+
+/// Memory of a task.
+struct Scratch {
+    /// x, y, x² + y² and xy.
+    inputs: [Ring; 4],
+    /// Their vertical blurs in the rows of a step, with margins.
+    blurred: [[Vec<f32>; 4]; STEP],
+    /// SSIM and its derivatives in a row, with margins.
+    slopes: [Vec<f32>; 4],
+    /// Horizontal blurs of the derivatives.
+    derivatives: [Ring; 3],
+}
+
+impl Scratch {
+    fn new(width: usize) -> Scratch {
+        // Sums of SSIM are over two vectors.
+        let stride = width.next_multiple_of(ROWS);
+        let row = |_| vec![0.0; stride + 2 * MARGIN];
+        Scratch {
+            inputs: std::array::from_fn(|_| Ring::new(stride)),
+            blurred: std::array::from_fn(|_| std::array::from_fn(row)),
+            slopes: std::array::from_fn(row),
+            derivatives: std::array::from_fn(|_| Ring::new(stride)),
         }
     }
 }
 
-/// Horizontal blurs, SSIM, and the horizontal blurs of its derivatives.
-pub(super) fn rows(call: &mut NativeCall) -> Result<(), String> {
-    let [width, height, strips, first, end] = call.words()?.map(|word| word as usize);
-    let [means, moments, slopes, cross, sums] = call.memory([0, 1, 2, 3, 4])?;
-    let (rows, level) = (3 * height, Level::new());
-    let count = rows * width;
-    let (means, moments): (&[f32], &[f32]) = (means.of(), moments.of());
-    let blurred = [&means[..count], &means[count..], &moments[..count], &moments[count..]];
-    let [by_mean, by_square] = planes(slopes.of(), count);
-    let by_product = cross.of::<f32>()[..count].par_chunks_mut(width);
-    let out = by_mean.par_chunks_mut(width).zip(by_square.par_chunks_mut(width)).zip(by_product);
-    let sums = sums.of::<f32>()[..rows * strips].par_chunks_mut(strips);
-    out.zip(sums).enumerate().for_each_init(
-        || RowScratch::new(width),
-        |scratch, (row, (((by_mean, by_square), by_product), sums))| {
-            let at = row * width..(row + 1) * width;
-            for (wide, plane) in scratch.wide.iter_mut().zip(blurred) {
-                wide[REACH..REACH + width].copy_from_slice(&plane[at.clone()]);
-                wide[REACH + width..].fill(0.0);
-            }
-            dispatch!(level, simd => scratch.compute(simd, width));
-            let is_counted = (first..end).contains(&(row % height));
-            for (sum, own) in sums.iter_mut().zip(scratch.wide[3][REACH..REACH + width].chunks(ROWS)) {
-                *sum = if is_counted { own.iter().sum() } else { 0.0 };
-            }
-            for (out, blurred) in [by_mean, by_square, by_product].into_iter().zip(&scratch.blurred) {
-                out.copy_from_slice(&blurred[..width]);
-            }
-        },
-    );
-    Ok(())
-}
-
-/// The loss of [`gradient`], of one channel.
+/// The loss of one channel.
 struct Loss<'a> {
-    images: Images<'a>,
+    x: &'a [f32],
+    y: &'a [f32],
+    /// Weights of the pixels.
+    weights: Option<&'a [f32]>,
+    width: usize,
+    height: usize,
     l1_weight: f32,
     dssim_weight: f32,
-    /// Blurred derivatives by (E[x], E[x²], E[xy]); empty without SSIM.
-    derivatives: [&'a [f32]; 3],
+    with_ssim: bool,
     /// Rows with a gradient.
     rows: Range<usize>,
 }
 
+/// Results of a task: the gradient, and the sums of SSIM over strips of rows and of absolute
+/// differences over strips of columns.
+struct Results<'a> {
+    gradient: &'a mut [f32],
+    ssim: &'a mut [f32],
+    l1: &'a mut [f32],
+}
+
 impl Loss<'_> {
-    /// Gradient of a strip, and the sums of the absolute differences of its columns.
+    /// The task that begins at row `first`.
     #[inline(always)]
-    fn strip<S: Simd>(&self, simd: S, image: &Strips, strip: usize, gradient: &mut [f32], sums: &mut [f32]) {
-        let with_ssim = !self.derivatives[0].is_empty();
-        let mut rows = [[[0.0; BLOCK]; READ]; 3];
-        let mut blurred = [[0.0; BLOCK]; 3];
-        sums.fill(0.0);
-        for first in image.blocks() {
-            let columns = BLOCK.min(image.width - first);
-            for (i, at) in image.rows(strip, first).enumerate().filter(|_| with_ssim) {
-                for (rows, plane) in rows.iter_mut().zip(self.derivatives) {
-                    match &at {
-                        Some(at) => read(simd, &plane[at.clone()], &mut rows[i]),
-                        None => rows[i].fill(0.0),
-                    }
+    fn task<S: Simd>(&self, simd: S, first: usize, scratch: &mut Scratch, out: &mut Results) {
+        let steps = (out.gradient.len() / self.width).div_ceil(STEP);
+        out.l1.fill(0.0);
+        // Blurs lag behind the rows that they read, and begin as many rows before the first one.
+        for step in 0..steps + 2 * LAG {
+            if self.with_ssim {
+                for row in step * STEP..(step + 1) * STEP {
+                    let y = (first + row).checked_sub(2 * REACH).filter(|y| *y < self.height);
+                    self.read(simd, y, row, &mut scratch.inputs);
+                }
+                if let Some(step) = step.checked_sub(LAG) {
+                    self.derive(simd, first, step, scratch, out.ssim);
                 }
             }
-            for (k, gradient) in gradient.chunks_exact_mut(image.width).enumerate() {
-                let row = strip * ROWS + k;
-                let gradient = &mut gradient[first..first + columns];
-                if !self.rows.contains(&row) {
-                    gradient.fill(0.0);
-                    continue;
-                }
-                for (rows, blurred) in rows.iter().zip(&mut blurred).filter(|_| with_ssim) {
-                    blur_columns(simd, rows, k, blurred);
-                }
-                let at = row * image.width + first..row * image.width + first + columns;
-                self.differentiate(simd, at, &blurred, gradient, &mut sums[first..first + columns]);
+            if let Some(step) = step.checked_sub(2 * LAG) {
+                self.differentiate(simd, first, step, &scratch.derivatives, out);
             }
         }
     }
 
-    /// The gradient of pixels `at`; adds the absolute differences.
+    /// Values of up to eight pixels in both images, and their weights; a pixel of weight 0 has the
+    /// value of the target.
+    #[inline(always)]
+    fn values<S: Simd>(&self, simd: S, at: Range<usize>) -> [f32x8<S>; 3] {
+        let (x, y) = (load(simd, &self.x[at.clone()]), load(simd, &self.y[at.clone()]));
+        match self.weights {
+            Some(weights) => {
+                let weights = load(simd, &weights[at]);
+                [weights.mul_add(x - y, y), y, weights]
+            }
+            None => [x, y, f32x8::simd_from(simd, 1.0)],
+        }
+    }
+
+    /// Places of the blocks of eight columns of a row of the image, each with its first column.
+    fn blocks(&self, y: usize) -> impl Iterator<Item = (usize, Range<usize>)> {
+        let (first, width) = (y * self.width, self.width);
+        (0..width).step_by(LANES).map(move |x| (x, first + x..first + (x + LANES).min(width)))
+    }
+
+    /// Reads row `y` of the images, or zeros outside of them, to row `row` of the rings.
+    #[inline(always)]
+    fn read<S: Simd>(&self, simd: S, y: Option<usize>, row: usize, rings: &mut [Ring; 4]) {
+        let [xs, ys, squares, products] = rings.each_mut().map(|ring| ring.row(row));
+        let Some(y) = y else {
+            return [xs, ys, squares, products].into_iter().for_each(|row| row.fill(0.0));
+        };
+        for (column, at) in self.blocks(y) {
+            let own = column..column + LANES;
+            let [x, y, _] = self.values(simd, at);
+            x.store_slice(&mut xs[own.clone()]);
+            y.store_slice(&mut ys[own.clone()]);
+            x.mul_add(x, y * y).store_slice(&mut squares[own.clone()]);
+            (x * y).store_slice(&mut products[own]);
+        }
+    }
+
+    /// SSIM and the blurred derivatives of the rows of a step.
+    #[inline(always)]
+    fn derive<S: Simd>(&self, simd: S, first: usize, step: usize, scratch: &mut Scratch, sums: &mut [f32]) {
+        let Scratch { inputs, blurred, slopes, derivatives } = scratch;
+        for (plane, ring) in inputs.iter().enumerate() {
+            let rows = ring.window(step);
+            for at in (0..self.width).step_by(LANES) {
+                for (row, sum) in blurred.iter_mut().zip(blur_columns(simd, &rows, at)) {
+                    sum.store_slice(&mut row[plane][MARGIN + at..MARGIN + at + LANES]);
+                }
+            }
+        }
+        let strips = self.width.div_ceil(ROWS);
+        for (k, blurred) in blurred.iter_mut().enumerate() {
+            let row = step * STEP + k;
+            let out = derivatives.each_mut().map(|ring| ring.row(row));
+            let Some(y) = (first + row).checked_sub(REACH).filter(|y| *y < self.height) else {
+                out.into_iter().for_each(|row| row.fill(0.0));
+                continue;
+            };
+            self.slopes(simd, blurred, slopes);
+            for (out, slopes) in out.into_iter().zip(&*slopes) {
+                for at in (0..self.width).step_by(LANES) {
+                    blur_row(simd, slopes, at).store_slice(&mut out[at..at + LANES]);
+                }
+            }
+            let own = y.checked_sub(first).and_then(|y| sums.get_mut(y * strips..(y + 1) * strips));
+            for (strip, sum) in own.into_iter().flatten().enumerate() {
+                let at = MARGIN + strip * ROWS;
+                let half = |at: usize| f32x8::from_slice(simd, &slopes[3][at..at + LANES]);
+                let sum_of_strip = (half(at) + half(at + LANES)).reduce_sum();
+                *sum = if self.rows.contains(&y) { sum_of_strip } else { 0.0 };
+            }
+        }
+    }
+
+    /// SSIM and its derivatives in a row, from its vertical blurs; 0 in columns beyond the image.
+    #[inline(always)]
+    fn slopes<S: Simd>(&self, simd: S, blurred: &mut [Vec<f32>; 4], slopes: &mut [Vec<f32>; 4]) {
+        blurred.iter_mut().for_each(|row| row[MARGIN + self.width..].fill(0.0));
+        for at in (0..self.width).step_by(LANES) {
+            let mut sums = [f32x8::simd_from(simd, 0.0); 4];
+            for (sum, row) in sums.iter_mut().zip(&*blurred) {
+                *sum = blur_row(simd, row, at);
+            }
+            for (row, value) in slopes.iter_mut().zip(ssim_of(sums)) {
+                value.store_slice(&mut row[MARGIN + at..MARGIN + at + LANES]);
+            }
+        }
+        slopes.iter_mut().for_each(|row| row[MARGIN + self.width..].fill(0.0));
+    }
+
+    /// Gradient of the rows of a step; adds their absolute differences.
     #[inline(always)]
     fn differentiate<S: Simd>(
         &self,
         simd: S,
-        at: Range<usize>,
-        [a, b, c]: &[[f32; BLOCK]; 3],
-        gradient: &mut [f32],
-        sums: &mut [f32],
+        first: usize,
+        step: usize,
+        derivatives: &[Ring; 3],
+        out: &mut Results,
     ) {
-        let [mut x, mut y, mut out] = [[0.0; BLOCK]; 3];
-        self.images.values(simd, at.clone(), &mut x, &mut y);
-        for k in 0..BLOCK {
-            let slope = self.l1_weight * sign(x[k] - y[k]);
-            out[k] = slope - self.dssim_weight * (a[k] + 2.0 * x[k] * b[k] + y[k] * c[k]);
+        let rows = derivatives.each_ref().map(|ring| ring.window(step));
+        let l1 = &mut out.l1[step * STEP / ROWS * self.width..][..self.width];
+        for column in (0..self.width).step_by(LANES) {
+            let columns = column..(column + LANES).min(self.width);
+            let mut blurred = [[f32x8::simd_from(simd, 0.0); STEP]; 3];
+            for (blurred, rows) in blurred.iter_mut().zip(&rows).filter(|_| self.with_ssim) {
+                *blurred = blur_columns(simd, rows, column);
+            }
+            let mut sum = load(simd, &l1[columns.clone()]);
+            for (k, row) in (step * STEP..(step + 1) * STEP).enumerate() {
+                let own = row * self.width + columns.start..row * self.width + columns.end;
+                let Some(gradient) = out.gradient.get_mut(own.clone()) else { break };
+                if !self.rows.contains(&(first + row)) {
+                    gradient.fill(0.0);
+                    continue;
+                }
+                let [x, y, weights] =
+                    self.values(simd, first * self.width + own.start..first * self.width + own.end);
+                let [a, b, c] = [blurred[0][k], blurred[1][k], blurred[2][k]];
+                let (difference, zero) = (x - y, f32x8::simd_from(simd, 0.0));
+                let slope = f32x8::simd_from(simd, self.l1_weight).copysign(difference);
+                // The subgradient at 0 is 0.
+                let slope = difference.abs().simd_gt(zero).select(slope, zero);
+                let by_ssim = (x * 2.0).mul_add(b, y.mul_add(c, a));
+                store((slope - by_ssim * self.dssim_weight) * weights, gradient);
+                sum += difference.abs();
+            }
+            store(sum, &mut l1[columns]);
         }
-        if let Some(weights) = self.images.weights {
-            out.iter_mut().zip(&weights[at]).for_each(|(out, weight)| *out *= weight);
-        }
-        write(simd, &out, gradient);
-        sums.iter_mut().zip(x.iter().zip(&y)).for_each(|(sum, (x, y))| *sum += (x - y).abs());
     }
 }
 
-/// Vertical blurs of the derivatives, the gradient, and the sums of absolute differences; without
-/// SSIM the last two alone.
+/// The first passes, whose work is done by [`gradient`].
+pub(super) fn nothing(_: &mut NativeCall) -> Result<(), String> {
+    Ok(())
+}
+
+/// The gradient, and the sums of SSIM and absolute differences; without SSIM the last alone.
 pub(super) fn gradient(call: &mut NativeCall) -> Result<(), String> {
     let words: [u32; 8] = call.words()?;
     let [width, height] = [0, 1].map(|k| words[k] as usize);
     let [l1_weight, dssim_weight] = [2, 3].map(|k| f32::from_bits(words[k]));
     let [first, end, weighted, first_sum] = [4, 5, 6, 7].map(|k| words[k] as usize);
-    let (plane, strips, level) = (width * height, height.div_ceil(ROWS), Level::new());
+    let (plane, level) = (width * height, Level::new());
     let with_ssim = call.variant()[0] == 1;
-    // Without SSIM there are no derivatives.
-    let [rendered, target, slopes, cross, gradient, sums] = call.optional([0, 1, 2, 3, 4, 5]);
+    let [rendered, target, gradient, sums] = call.memory([0, 1, 4, 5])?;
     let (rendered, target): (&[f32], &[f32]) = (rendered.of(), target.of());
-    let (slopes, cross): (&[f32], &[f32]) = (slopes.of(), cross.of());
+    let (ssim, l1) = sums.of::<f32>().split_at_mut(first_sum);
+    let (strips, column_strips) = (width.div_ceil(ROWS), height.div_ceil(ROWS));
+    // Long tasks, since each begins with rows of another one. No result depends on their number.
+    let strips_of_task = column_strips.div_ceil(rayon::current_num_threads()).max(1);
+    let task_rows = ROWS * strips_of_task;
     let gradient = gradient.of::<f32>()[..3 * plane].par_chunks_mut(plane);
-    let sums = sums.of::<f32>()[first_sum..][..3 * strips * width].par_chunks_mut(strips * width);
-    gradient.zip(sums).enumerate().for_each(|(channel, (gradient, sums))| {
+    let ssim = ssim[..3 * strips * height].par_chunks_mut(strips * height);
+    let l1 = l1[..3 * column_strips * width].par_chunks_mut(column_strips * width);
+    gradient.zip(ssim).zip(l1).enumerate().for_each(|(channel, ((gradient, ssim), l1))| {
         let own = channel * plane..(channel + 1) * plane;
         let loss = Loss {
-            images: Images::of(rendered, target, plane, channel, weighted != 0),
+            x: &rendered[own.clone()],
+            y: &target[own],
+            weights: (weighted != 0).then(|| &target[3 * plane..4 * plane]),
+            width,
+            height,
             l1_weight,
             dssim_weight,
-            derivatives: match with_ssim {
-                true => [&slopes[own.clone()], &slopes[3 * plane..][own.clone()], &cross[own]],
-                false => [&[]; 3],
-            },
+            with_ssim,
             rows: first..end,
         };
-        let strips = gradient.par_chunks_mut(ROWS * width).zip(sums.par_chunks_mut(width));
-        strips.enumerate().for_each(|(strip, (gradient, sums))| {
-            let image = Strips { width, height };
-            dispatch!(level, simd => loss.strip(simd, &image, strip, gradient, sums));
-        });
+        let gradient = gradient.par_chunks_mut(task_rows * width);
+        let ssim = ssim.par_chunks_mut(task_rows * strips);
+        let l1 = l1.par_chunks_mut(strips_of_task * width);
+        gradient.zip(ssim).zip(l1).enumerate().for_each_init(
+            || Scratch::new(width),
+            |scratch, (task, ((gradient, ssim), l1))| {
+                let mut out = Results { gradient, ssim, l1 };
+                dispatch!(level, simd => loss.task(simd, task * task_rows, scratch, &mut out));
+            },
+        );
     });
     Ok(())
 }
-
-const _: () = assert!(TAPS == 2 * REACH + 1);

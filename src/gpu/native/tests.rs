@@ -67,7 +67,8 @@ fn adam_matches_shader() {
 
 #[test]
 fn ssim_and_l1_match_shaders() {
-    for (width, height) in [(75, 53), (13, 7), (130, 33)] {
+    // Sizes below one vector and one window, and a whole number of both.
+    for (width, height) in [(75, 53), (13, 7), (7, 5), (130, 33), (24, 80)] {
         for (weighted, weights) in
             [(false, [0.8, 0.2]), (true, [0.8, 0.2]), (false, [0.7, 0.0]), (true, [0.7, 0.0])]
         {
