@@ -110,7 +110,17 @@ fn ssim_and_l1_match_shaders() {
 
 /// A training step's rasterisation with upstream noise: planes, and gradients of all parameters.
 fn rasterised(device: &Device, degree: u32, features: usize, size: [u32; 2]) -> Vec<(String, Vec<f32>)> {
-    let (splats, camera) = seeded::benchmark(900, size[0], size[1], degree, 5);
+    let (mut splats, camera) = seeded::benchmark(900, size[0], size[1], degree, 5);
+    for i in 0..900 {
+        let [x, y, z] = splats.means[i];
+        match i % 16 {
+            // Behind the camera, far beside the image, and too faint.
+            3 => splats.means[i] = [-x, -y, -z],
+            8 => splats.means[i] = [50.0 * x, y, z],
+            13 => splats.opacity_logits[i] = -20.0,
+            _ => {}
+        }
+    }
     let codes = numbers(900 * features, 6);
     let params = SplatBuffers::upload(device, &splats, &codes, features).unwrap();
     let gradients = params.zeros_like(device).unwrap();
