@@ -1,13 +1,14 @@
 //! Compares every rasterisation pass on the GPU with its f64 reference, with validation on.
 mod support;
 use glam::DVec3;
-use splatvk::gpu::{Device, Recorder, test_device};
+use splatvk::gpu::{Device, Options, Recorder, TestDevice, native, options, test_device};
 use splatvk::math::Random;
 use splatvk::pass::channels::BASE_CHANNELS;
 use splatvk::pass::raster_backward;
 use splatvk::pass::raster_forward::{Cutoffs, ReferenceScene};
 use splatvk::pass::{
-    DeviceChoices, FeatureMode, RasterOptions, Rasterizer, Renderer, SplatBuffers, TileBinning, View,
+    DeviceChoices, FeatureMode, GradientReduction, RasterOptions, Rasterizer, Renderer, SplatBuffers,
+    TileBinning, View, pairs,
 };
 use splatvk::scene::seeded;
 use splatvk::scene::{Pose, Splats};
@@ -207,8 +208,9 @@ fn long_lists_are_complete() {
     }
 }
 
-/// Splats beside the image have no tile, but the lane that reaches the splats behind them walks
-/// over them: 200 000 that are smaller than a tile, or as tall as the image's 125 rows of tiles.
+/// Splats beside the image have no tile, but where they are sorted, too, the lane that reaches the
+/// splats behind them walks over them: 200 000 that are smaller than a tile, or as tall as the
+/// image's 125 rows of tiles.
 #[test]
 fn splats_beside_the_image_end_no_list() {
     const BESIDE: u32 = 200_000;
@@ -223,13 +225,46 @@ fn splats_beside_the_image_end_no_list() {
         append(&mut splats, splat([0.0, 0.0, 9.0], 50.0, 3.0));
         let scene = front_scene(splats, 40, 1000);
         for grouping in [TileBinning::Counting, TileBinning::Sorting] {
-            let (params, mut raster) =
-                scene.upload_for(&device, DeviceChoices { grouping, ..DeviceChoices::of(&device) });
-            raster.forward(&params, &scene.options).unwrap();
-            let lists = raster.tile_lists().unwrap();
-            let whole = lists.iter().filter(|list| **list == [0, BESIDE + 1]).count();
-            assert_eq!(whole, 5 * 125, "height {height}, {grouping:?}");
+            for summation in [GradientReduction::Atomics, GradientReduction::Entries] {
+                let choices = DeviceChoices { grouping, summation, ..DeviceChoices::of(&device) };
+                let (params, mut raster) = scene.upload_for(&device, choices);
+                raster.forward(&params, &scene.options).unwrap();
+                let lists = raster.tile_lists().unwrap();
+                let whole = lists.iter().filter(|list| **list == [0, BESIDE + 1]).count();
+                assert_eq!(whole, 5 * 125, "height {height}, {grouping:?}, {summation:?}");
+            }
         }
+    }
+}
+
+/// Splats around the borders of a small image, of any size and direction: none is dropped that
+/// reaches a tile, by shaders or in native code.
+#[test]
+fn splats_at_borders_stay_in_lists() {
+    let natives = TestDevice::open(&Options { natives: native::ALL, ..options(None) }).unwrap();
+    let mut scene = Scene::small(3000, 0, 0, 78);
+    let mut random = Random::new(5);
+    for (mean, scales) in scene.splats.means.iter_mut().zip(&mut scene.splats.log_scales) {
+        let z = random.between(1.0, 6.0);
+        *mean = [random.between(-2.0, 2.0) * z, random.between(-2.0, 2.0) * z, z].map(|x| x as f32);
+        *scales = [0; 3].map(|_| random.between(-6.0, 1.0) as f32);
+    }
+    let device = test_device();
+    let (total, extra) = assert_lists(&device, &scene);
+    assert!(total > 10_000 && extra * 100 < total, "{extra} of {total}");
+    let lists = |device: &Device| {
+        let (params, mut raster) = scene.upload_for(device, DeviceChoices::of(device));
+        raster.forward(&params, &scene.options).unwrap();
+        (pairs::visible(&raster).unwrap(), raster.tile_lists().unwrap())
+    };
+    let (by_shaders, in_native) = (lists(&device), lists(&natives));
+    let entries = |lists: &[Vec<u32>]| lists.iter().map(Vec::len).sum::<usize>();
+    assert!(entries(&by_shaders.1).abs_diff(entries(&in_native.1)) * 1000 < total);
+    for (visible, lists) in [by_shaders, in_native] {
+        let listed: std::collections::BTreeSet<u32> = lists.into_iter().flatten().collect();
+        println!("{visible} visible, {} in lists", listed.len());
+        assert!(visible >= listed.len() && visible < 3000, "{visible}");
+        assert!(visible * 4 < listed.len() * 5, "{visible} of {}", listed.len());
     }
 }
 

@@ -176,7 +176,7 @@ fn add_figures(
     };
     section.bound(&work, roofline);
     section.figure("intersections", intersections, "tile–splat pairs");
-    section.figure("visible splats", pairs::visible(p.raster, p.params.count)? as f64, "");
+    section.figure("visible splats", pairs::visible(p.raster)? as f64, "");
     section.figure("pairs evaluated", pairs.evaluated, "pixel–splat pairs");
     section.figure("pairs blended", pairs.blended, "pixel–splat pairs");
     section.figure("evaluated / blended", pairs.evaluated / pairs.blended, "");

@@ -88,7 +88,7 @@ pub struct Rasterizer {
     strip: u32,
     sort: Sort,
     /// Number of visible splats, and of all.
-    count: Buffer<u32>,
+    pub(super) count: Buffer<u32>,
 }
 
 impl Rasterizer {
