@@ -19,8 +19,9 @@ void main() {
     uint end = min((lane + 1u) * chunk, count);
     for (uint i = lane * chunk; i < end; i++) {
         uvec2 pair = pairs[i];
-        if (drop != 0u && (pair.x & mask) == mask) continue;
-        uint slot = (((pair.x & mask) >> shift) & 255u) * 8u + column;
+        uint key = pair.x & mask;
+        if (drop != 0u && key == mask) continue;
+        uint slot = ((key >> shift) & 255u) * 8u + column;
         uint place = places[slot];
         places[slot] = place + 1u;
         sorted[place] = pair;

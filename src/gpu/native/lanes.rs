@@ -91,34 +91,91 @@ impl<S: Simd> Mul<f32x8<S>> for Vec3s<S> {
     }
 }
 
-/// Columns of up to eight rows; 0 in lanes beyond the last row.
+/// Numbers of a splat at most.
+const MOST: usize = 48;
+
+/// Exchanges rows and columns.
+#[inline(always)]
+fn transposed<S: Simd>(mut rows: [f32x8<S>; LANES]) -> [f32x8<S>; LANES] {
+    // Each round turns the bits (row, column) of a place by one.
+    for _ in 0..3 {
+        let old = rows;
+        for k in 0..LANES / 2 {
+            rows[2 * k] = old[k].zip_low(old[k + LANES / 2]);
+            rows[2 * k + 1] = old[k].zip_high(old[k + LANES / 2]);
+        }
+    }
+    rows
+}
+
+/// Columns of eight rows of `stride` numbers.
+#[inline(always)]
+fn gather_whole<S: Simd>(simd: S, rows: &[f32], stride: usize, columns: &mut [f32x8<S>]) {
+    let (rows, count) = (rows[..LANES * stride].chunks_exact(stride), columns.len());
+    if count < LANES {
+        for (k, column) in columns.iter_mut().enumerate() {
+            let mut numbers = [0.0; LANES];
+            numbers.iter_mut().zip(rows.clone()).for_each(|(number, row)| *number = row[k]);
+            *column = f32x8::simd_from(simd, numbers);
+        }
+        return;
+    }
+    for first in (0..count).step_by(LANES) {
+        // The last eight columns overlap those before them.
+        let first = first.min(count - LANES);
+        let mut eight = [f32x8::simd_from(simd, 0.0); LANES];
+        for (eight, row) in eight.iter_mut().zip(rows.clone()) {
+            *eight = f32x8::from_slice(simd, &row[first..first + LANES]);
+        }
+        columns[first..first + LANES].copy_from_slice(&transposed(eight));
+    }
+}
+
+/// Columns of up to eight rows of `stride` numbers; 0 in lanes beyond the last row.
+#[inline(always)]
+pub(super) fn gather_rows<S: Simd>(simd: S, rows: &[f32], stride: usize, columns: &mut [f32x8<S>]) {
+    if rows.len() >= LANES * stride {
+        gather_whole(simd, rows, stride, columns);
+    } else {
+        let mut padded = [0.0; LANES * MOST];
+        padded[..rows.len()].copy_from_slice(rows);
+        gather_whole(simd, &padded, stride, columns);
+    }
+}
+
+/// Writes up to eight rows of `stride` numbers from their first columns.
+#[inline(always)]
+pub(super) fn scatter_rows<S: Simd>(columns: &[f32x8<S>], rows: &mut [f32], stride: usize) {
+    let count = columns.len();
+    if count < LANES {
+        for (k, column) in columns.iter().enumerate() {
+            let numbers = column.to_array();
+            rows.chunks_exact_mut(stride).zip(numbers).for_each(|(row, number)| row[k] = number);
+        }
+        return;
+    }
+    for first in (0..count).step_by(LANES) {
+        let first = first.min(count - LANES);
+        let mut eight = [columns[0]; LANES];
+        eight.copy_from_slice(&columns[first..first + LANES]);
+        for (row, eight) in rows.chunks_exact_mut(stride).zip(transposed(eight)) {
+            eight.store_slice(&mut row[first..first + LANES]);
+        }
+    }
+}
+
+/// [`gather_rows`] of all columns.
 #[inline(always)]
 pub(super) fn gather<S: Simd, const N: usize>(simd: S, rows: &[[f32; N]]) -> [f32x8<S>; N] {
-    let mut padded = [[0.0; N]; LANES];
-    let rows = rows.first_chunk().unwrap_or_else(|| {
-        padded[..rows.len()].copy_from_slice(rows);
-        &padded
-    });
     let mut columns = [f32x8::simd_from(simd, 0.0); N];
-    for (k, column) in columns.iter_mut().enumerate() {
-        let mut numbers = [0.0; LANES];
-        numbers.iter_mut().zip(rows).for_each(|(number, row)| *number = row[k]);
-        *column = f32x8::simd_from(simd, numbers);
-    }
+    gather_rows(simd, rows.as_flattened(), N, &mut columns);
     columns
 }
 
-/// Writes up to eight rows from their columns.
+/// [`scatter_rows`] of all columns.
 #[inline(always)]
 pub(super) fn scatter<S: Simd, const N: usize>(columns: &[f32x8<S>; N], rows: &mut [[f32; N]]) {
-    let mut padded = [[0.0; N]; LANES];
-    for (k, column) in columns.iter().enumerate() {
-        padded.iter_mut().zip(column.to_array()).for_each(|(row, number)| row[k] = number);
-    }
-    match rows.first_chunk_mut() {
-        Some(rows) => *rows = padded,
-        None => rows.copy_from_slice(&padded[..rows.len()]),
-    }
+    scatter_rows(columns, rows.as_flattened_mut(), N);
 }
 
 /// Powers of e, between 2⁻¹²⁶ and 2¹²⁶.

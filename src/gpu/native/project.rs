@@ -46,19 +46,20 @@ impl<S: Simd> Camera<S> {
 impl Splats<'_> {
     /// Colours of up to eight splats.
     #[inline(always)]
-    fn colours<S: Simd>(&self, simd: S, offset: Vec3s<S>, own: &Range<usize>) -> Vec3s<S> {
+    fn colours<S: Simd, const N: usize>(&self, simd: S, offset: Vec3s<S>, own: &Range<usize>) -> Vec3s<S> {
         let direction = offset * (f32x8::simd_from(simd, 1.0) / offset.dot(offset).sqrt());
-        let (rows, basis) = (self.sh.rows(own), sh::basis(simd, direction, self.sh.degree));
+        let coefficients: [_; N] = self.sh.of(simd, own);
+        let basis: [_; N] = sh::basis(simd, direction);
         let mut colour = Vec3s::splat(simd, [0.5; 3]);
-        for (k, basis) in basis.into_iter().enumerate().take(self.sh.count()) {
-            colour += sh::coefficient(simd, &rows, k) * basis;
+        for k in 0..N {
+            colour += Vec3s(coefficients[k]) * basis[k];
         }
         Vec3s([colour[0].max(0.0), colour[1].max(0.0), colour[2].max(0.0)])
     }
 
-    /// Projects up to eight splats.
+    /// Projects up to eight splats with `N` SH coefficients.
     #[inline(always)]
-    fn project<S: Simd>(
+    fn project<S: Simd, const N: usize>(
         &self,
         simd: S,
         camera: &Camera<S>,
@@ -71,7 +72,7 @@ impl Splats<'_> {
         if self.antialiased {
             log2_opacity += log2(g.squared_area() * g.conic_det) * 0.5;
         }
-        let colour = self.colours(simd, mean - camera.position, &own);
+        let colour = self.colours::<S, N>(simd, mean - camera.position, &own);
         let centre =
             |axis: usize| (camera.focal[axis] * g.t[axis]).mul_add(g.inverse_z, camera.centre[axis] - 0.5);
         let centre = [centre(0), centre(1)];
@@ -103,8 +104,17 @@ impl Splats<'_> {
 }
 
 pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
+    match call.variant()[0] {
+        0 => run_with::<1>(call),
+        1 => run_with::<4>(call),
+        2 => run_with::<9>(call),
+        _ => run_with::<16>(call),
+    }
+}
+
+fn run_with<const N: usize>(call: &mut NativeCall) -> Result<(), String> {
     let [count, sh_stride, antialiased, sort_words, list_words] = call.words()?.map(|word| word as usize);
-    let (degree, level) = (call.variant()[0], Level::new());
+    let level = Level::new();
     let [camera, means, log_scales, quats, opacity_logits, sh, projected, pairs, splats, sort, list] =
         call.memory([0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10])?;
     splats.of::<u32>()[..2].fill(count as u32);
@@ -116,20 +126,20 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
         log_scales: log_scales.of(),
         quats: quats.of(),
         opacity_logits: opacity_logits.of(),
-        sh: Coefficients::new(sh.of(), sh_stride, degree),
+        sh: Coefficients::new(sh.of(), sh_stride),
         antialiased: antialiased != 0,
     };
     let projected = projected.of::<[f32; FLOATS]>()[..count].par_chunks_mut(CHUNK);
     let pairs = pairs.of::<[u32; 2]>()[..count].par_chunks_mut(CHUNK);
     projected.zip(pairs).enumerate().for_each(|(chunk, (projected, pairs))| {
-        dispatch!(level, simd => project(simd, &splats, &view, chunk * CHUNK, projected, pairs));
+        dispatch!(level, simd => project::<_, N>(simd, &splats, &view, chunk * CHUNK, projected, pairs));
     });
     Ok(())
 }
 
 /// Projects splats from `first` on.
 #[inline(always)]
-fn project<S: Simd>(
+fn project<S: Simd, const N: usize>(
     simd: S,
     splats: &Splats,
     view: &CameraView,
@@ -141,6 +151,6 @@ fn project<S: Simd>(
     let eights = projected.chunks_mut(LANES).zip(pairs.chunks_mut(LANES));
     for (eight, (projected, pairs)) in eights.enumerate() {
         let first = first + eight * LANES;
-        splats.project(simd, &camera, first..first + projected.len(), projected, pairs);
+        splats.project::<S, N>(simd, &camera, first..first + projected.len(), projected, pairs);
     }
 }

@@ -77,6 +77,12 @@ fn outer<S: Simd>(a: Vec3s<S>, b: Vec3s<S>) -> [Vec3s<S>; 3] {
     [a * b[0], a * b[1], a * b[2]]
 }
 
+/// Product of a matrix of columns and a vector.
+#[inline(always)]
+fn product<S: Simd>(m: [Vec3s<S>; 3], v: Vec3s<S>) -> Vec3s<S> {
+    m[0] * v[0] + m[1] * v[1] + m[2] * v[2]
+}
+
 #[inline(always)]
 fn sum<S: Simd>(a: [Vec3s<S>; 3], b: [Vec3s<S>; 3]) -> [Vec3s<S>; 3] {
     [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
@@ -89,9 +95,9 @@ fn skew<S: Simd>([c0, c1, c2]: [Vec3s<S>; 3]) -> Vec3s<S> {
 }
 
 impl Splats<'_> {
-    /// Gradients of up to eight splats; adds to that of the camera.
+    /// Gradients of up to eight splats with `N` SH coefficients; adds to that of the camera.
     #[inline(always)]
-    fn backward<S: Simd>(
+    fn backward<S: Simd, const N: usize>(
         &self,
         simd: S,
         camera: &Camera<S>,
@@ -116,9 +122,8 @@ impl Splats<'_> {
         if self.antialiased {
             filter_backward(&g, up[0], &mut by_b);
         }
-        let columns = [g.rotation[0] * g.scale[0], g.rotation[1] * g.scale[1], g.rotation[2] * g.scale[2]];
-        let m = |b: Vec3s<S>| columns[0] * b[0] + columns[1] * b[1] + columns[2] * b[2];
-        let by_j = [camera.to_camera(m(by_b[0])), camera.to_camera(m(by_b[1]))];
+        let m = [g.rotation[0] * g.scale[0], g.rotation[1] * g.scale[1], g.rotation[2] * g.scale[2]];
+        let by_j = [camera.to_camera(product(m, by_b[0])), camera.to_camera(product(m, by_b[1]))];
         let by_centre =
             [-(g.conic[0] * up[1] + g.conic[1] * up[2]), -(g.conic[2] * up[2] + g.conic[1] * up[1])];
         let mut by_t = Vec3s([zero, zero, up[COLOUR + 3]]);
@@ -131,7 +136,7 @@ impl Splats<'_> {
             Vec3s([g.rotation[0].dot(by_m[0]), g.rotation[1].dot(by_m[1]), g.rotation[2].dot(by_m[2])]);
         let by_rotation = [by_m[0] * g.scale[0], by_m[1] * g.scale[1], by_m[2] * g.scale[2]];
         let by_colour = Vec3s([up[COLOUR], up[COLOUR + 1], up[COLOUR + 2]]).only(shown);
-        let by_offset = self.colour_backward(simd, own, mean - camera.position, by_colour, out.sh);
+        let by_offset = self.colour_backward::<S, N>(simd, own, mean - camera.position, by_colour, out.sh);
         let counts = shown & g.visible;
         let turn = sum(outer(g.j[0], by_j[0]), outer(g.j[1], by_j[1]));
         by_camera.rho += (by_t + camera.to_camera(by_offset)).only(counts);
@@ -155,7 +160,7 @@ impl Splats<'_> {
     /// Writes the gradients of the SH coefficients and returns that by the mean through the
     /// direction.
     #[inline(always)]
-    fn colour_backward<S: Simd>(
+    fn colour_backward<S: Simd, const N: usize>(
         &self,
         simd: S,
         own: &Range<usize>,
@@ -165,12 +170,12 @@ impl Splats<'_> {
     ) -> Vec3s<S> {
         let inverse_distance = f32x8::simd_from(simd, 1.0) / offset.dot(offset).sqrt();
         let direction = offset * inverse_distance;
-        let basis = sh::basis(simd, direction, self.sh.degree);
-        let slopes = sh::basis_gradient(simd, direction, self.sh.degree);
-        let (rows, zeros) = (self.sh.rows(own), Vec3s::splat(simd, [0.0; 3]));
+        let basis: [f32x8<S>; N] = sh::basis(simd, direction);
+        let slopes: [Vec3s<S>; N] = sh::basis_gradient(simd, direction);
+        let (coefficients, zeros): ([_; N], _) = (self.sh.of(simd, own), Vec3s::splat(simd, [0.0; 3]));
         let (mut colour, mut by_channel) = (Vec3s::splat(simd, [0.5; 3]), [zeros; 3]);
-        for k in 0..self.sh.count() {
-            let coefficient = sh::coefficient(simd, &rows, k);
+        for k in 0..N {
+            let coefficient = Vec3s(coefficients[k]);
             colour += coefficient * basis[k];
             for (channel, by) in by_channel.iter_mut().enumerate() {
                 *by += slopes[k] * coefficient[channel];
@@ -183,7 +188,7 @@ impl Splats<'_> {
             by_clamped[channel] = by;
             by_direction += by_channel[channel] * by;
         }
-        sh::scatter(&basis[..self.sh.count()], by_clamped, by_sh, own.len());
+        sh::scatter(&basis, by_clamped, by_sh, own.len());
         (by_direction - direction * direction.dot(by_direction)) * inverse_distance
     }
 }
@@ -259,8 +264,17 @@ fn quat_backward<S: Simd>(g: &Geometry<S>, m: [Vec3s<S>; 3]) -> [f32x8<S>; 4] {
 }
 
 pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
+    match call.variant()[0] {
+        0 => run_with::<1>(call),
+        1 => run_with::<4>(call),
+        2 => run_with::<9>(call),
+        _ => run_with::<16>(call),
+    }
+}
+
+fn run_with<const N: usize>(call: &mut NativeCall) -> Result<(), String> {
     let [count, sh_stride, antialiased] = call.words()?.map(|word| word as usize);
-    let (degree, groups, level) = (call.variant()[0], call.groups()[0] as usize, Level::new());
+    let (groups, level) = (call.groups()[0] as usize, Level::new());
     let memory = call.memory([0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12])?;
     let [
         camera,
@@ -283,7 +297,7 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
         log_scales: log_scales.of(),
         quats: quats.of(),
         opacity_logits: logits.of(),
-        sh: Coefficients::new(sh.of(), sh_stride, degree),
+        sh: Coefficients::new(sh.of(), sh_stride),
         antialiased: antialiased != 0,
     };
     let up: &[[f32; UP]] = &up.of()[..count];
@@ -303,7 +317,7 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
         .enumerate()
         .map(|(part, (((((means, log_scales), quats), opacity_logits), sh), up))| {
             let out = Gradients { means, log_scales, quats, opacity_logits, sh };
-            dispatch!(level, simd => backward(simd, &splats, &view, part * chunk, up, out))
+            dispatch!(level, simd => backward::<_, N>(simd, &splats, &view, part * chunk, up, out))
         })
         .collect();
     let parts = &mut parts.of::<f32>()[..PARTS * groups];
@@ -318,7 +332,7 @@ pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
 
 /// Gradients of splats from `first` on; returns that of the camera.
 #[inline(always)]
-fn backward<S: Simd>(
+fn backward<S: Simd, const N: usize>(
     simd: S,
     splats: &Splats,
     view: &CameraView,
@@ -331,7 +345,7 @@ fn backward<S: Simd>(
     for (eight, up) in up.chunks(LANES).enumerate() {
         let place = eight * LANES..eight * LANES + up.len();
         let own = first + place.start..first + place.end;
-        splats.backward(simd, &camera, &own, up, &mut by_camera, &mut out.part(place, stride));
+        splats.backward::<S, N>(simd, &camera, &own, up, &mut by_camera, &mut out.part(place, stride));
     }
     by_camera.sums()
 }

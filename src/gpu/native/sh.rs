@@ -1,73 +1,51 @@
 //! Spherical harmonics of eight directions in f32, as `glsl/shared/sh.glsl`, for the native passes.
-use super::lanes::{LANES, Vec3s};
+use super::lanes::{Vec3s, gather_rows, scatter_rows};
 use crate::scene::sh::{C0, C1, C2, C3};
 use fearless_simd::{Simd, f32x8, prelude::*};
 use std::ops::Range;
-
-/// Basis functions of degree 3.
-pub(super) const MOST: usize = 16;
 
 /// Coefficients of splats.
 pub(super) struct Coefficients<'a> {
     numbers: &'a [f32],
     /// Numbers of a splat.
     stride: usize,
-    pub degree: u32,
 }
 
 impl<'a> Coefficients<'a> {
-    pub fn new(numbers: &'a [f32], stride: usize, degree: u32) -> Coefficients<'a> {
-        Coefficients { numbers, stride: 3 * stride, degree }
+    pub fn new(numbers: &'a [f32], stride: usize) -> Coefficients<'a> {
+        Coefficients { numbers, stride: 3 * stride }
     }
 
-    /// Coefficients of each channel.
-    pub fn count(&self) -> usize {
-        ((self.degree + 1) * (self.degree + 1)) as usize
-    }
-
-    /// Those of up to eight splats; lanes beyond the last splat repeat it.
+    /// The first `N` RGB coefficients of up to eight splats.
     #[inline(always)]
-    pub fn rows(&self, own: &Range<usize>) -> [&'a [f32]; LANES] {
-        let row = |lane: usize| &self.numbers[(own.start + lane).min(own.end - 1) * self.stride..];
-        std::array::from_fn(|lane| &row(lane)[..3 * self.count()])
+    pub fn of<S: Simd, const N: usize>(&self, simd: S, own: &Range<usize>) -> [[f32x8<S>; 3]; N] {
+        let mut columns = [[f32x8::simd_from(simd, 0.0); 3]; N];
+        let rows = &self.numbers[own.start * self.stride..own.end * self.stride];
+        gather_rows(simd, rows, self.stride, columns.as_flattened_mut());
+        columns
     }
 }
 
-/// RGB coefficients `k` of eight splats.
+/// The first `N` basis functions, those of whole degrees, at unit directions.
 #[inline(always)]
-pub(super) fn coefficient<S: Simd>(simd: S, rows: &[&[f32]; LANES], k: usize) -> Vec3s<S> {
-    let mut numbers = [[0.0; LANES]; 3];
-    for (lane, row) in rows.iter().enumerate() {
-        let rgb = &row[3 * k..3 * k + 3];
-        numbers.iter_mut().zip(rgb).for_each(|(channel, number)| channel[lane] = *number);
-    }
-    Vec3s([
-        f32x8::simd_from(simd, numbers[0]),
-        f32x8::simd_from(simd, numbers[1]),
-        f32x8::simd_from(simd, numbers[2]),
-    ])
-}
-
-/// Basis functions up to `degree` at unit directions; those above it are 0.
-#[inline(always)]
-pub(super) fn basis<S: Simd>(simd: S, d: Vec3s<S>, degree: u32) -> [f32x8<S>; MOST] {
+pub(super) fn basis<S: Simd, const N: usize>(simd: S, d: Vec3s<S>) -> [f32x8<S>; N] {
     let [x, y, z] = d.0;
     let (xx, yy, zz) = (x * x, y * y, z * z);
-    let mut b = [f32x8::simd_from(simd, 0.0); MOST];
+    let mut b = [f32x8::simd_from(simd, 0.0); N];
     b[0] = f32x8::simd_from(simd, C0 as f32);
-    if degree >= 1 {
+    if N >= 4 {
         b[1] = y * -C1 as f32;
         b[2] = z * C1 as f32;
         b[3] = x * -C1 as f32;
     }
-    if degree >= 2 {
+    if N >= 9 {
         b[4] = x * y * C2[0] as f32;
         b[5] = y * z * C2[1] as f32;
         b[6] = (zz * 2.0 - xx - yy) * C2[2] as f32;
         b[7] = x * z * C2[3] as f32;
         b[8] = (xx - yy) * C2[4] as f32;
     }
-    if degree >= 3 {
+    if N >= 16 {
         b[9] = y * (xx * 3.0 - yy) * C3[0] as f32;
         b[10] = x * y * z * C3[1] as f32;
         b[11] = y * (zz * 4.0 - xx - yy) * C3[2] as f32;
@@ -81,25 +59,25 @@ pub(super) fn basis<S: Simd>(simd: S, d: Vec3s<S>, degree: u32) -> [f32x8<S>; MO
 
 /// Derivatives of [`basis`] by the direction, with its components as free variables.
 #[inline(always)]
-pub(super) fn basis_gradient<S: Simd>(simd: S, d: Vec3s<S>, degree: u32) -> [Vec3s<S>; MOST] {
+pub(super) fn basis_gradient<S: Simd, const N: usize>(simd: S, d: Vec3s<S>) -> [Vec3s<S>; N] {
     let [x, y, z] = d.0;
     let (xx, yy, zz) = (x * x, y * y, z * z);
     let number = |value: f64| f32x8::simd_from(simd, value as f32);
     let zero = number(0.0);
-    let mut g = [Vec3s([zero; 3]); MOST];
-    if degree >= 1 {
+    let mut g = [Vec3s([zero; 3]); N];
+    if N >= 4 {
         g[1] = Vec3s([zero, number(-C1), zero]);
         g[2] = Vec3s([zero, zero, number(C1)]);
         g[3] = Vec3s([number(-C1), zero, zero]);
     }
-    if degree >= 2 {
+    if N >= 9 {
         g[4] = Vec3s([y, x, zero]) * number(C2[0]);
         g[5] = Vec3s([zero, z, y]) * number(C2[1]);
         g[6] = Vec3s([x * -2.0, y * -2.0, z * 4.0]) * number(C2[2]);
         g[7] = Vec3s([z, zero, x]) * number(C2[3]);
         g[8] = Vec3s([x * 2.0, y * -2.0, zero]) * number(C2[4]);
     }
-    if degree >= 3 {
+    if N >= 16 {
         g[9] = Vec3s([x * y * 6.0, (xx - yy) * 3.0, zero]) * number(C3[0]);
         g[10] = Vec3s([y * z, x * z, x * y]) * number(C3[1]);
         g[11] = Vec3s([x * y * -2.0, zz * 4.0 - xx - yy * 3.0, y * z * 8.0]) * number(C3[2]);
@@ -114,16 +92,19 @@ pub(super) fn basis_gradient<S: Simd>(simd: S, d: Vec3s<S>, degree: u32) -> [Vec
 /// Writes the gradients by the coefficients of `count` splats, `basis` × `by_colour`; 0 for higher
 /// degrees.
 #[inline(always)]
-pub(super) fn scatter<S: Simd>(basis: &[f32x8<S>], by_colour: Vec3s<S>, out: &mut [f32], count: usize) {
+pub(super) fn scatter<S: Simd, const N: usize>(
+    basis: &[f32x8<S>; N],
+    by_colour: Vec3s<S>,
+    out: &mut [f32],
+    count: usize,
+) {
     let stride = out.len() / count;
-    if stride > 3 * basis.len() {
+    if stride > 3 * N {
         out.fill(0.0);
     }
-    for (k, basis) in basis.iter().enumerate() {
-        let by = by_colour * *basis;
-        let rgb = [by[0].to_array(), by[1].to_array(), by[2].to_array()];
-        for (lane, out) in out.chunks_exact_mut(stride).enumerate() {
-            out[3 * k..3 * k + 3].copy_from_slice(&[rgb[0][lane], rgb[1][lane], rgb[2][lane]]);
-        }
+    let mut columns = [by_colour.0; N];
+    for (rgb, basis) in columns.iter_mut().zip(basis) {
+        *rgb = (by_colour * *basis).0;
     }
+    scatter_rows(columns.as_flattened(), out, stride);
 }

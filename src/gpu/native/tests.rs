@@ -109,8 +109,16 @@ fn ssim_and_l1_match_shaders() {
 }
 
 /// A training step's rasterisation with upstream noise: planes, and gradients of all parameters.
-fn rasterised(device: &Device, degree: u32, features: usize, size: [u32; 2]) -> Vec<(String, Vec<f32>)> {
+/// Splats of odd degrees are antialiased; `faulty` is an upstream number that is not one.
+fn rasterised(
+    device: &Device,
+    degree: u32,
+    features: usize,
+    size: [u32; 2],
+    faulty: Option<usize>,
+) -> Vec<(String, Vec<f32>)> {
     let (mut splats, camera) = seeded::benchmark(900, size[0], size[1], degree, 5);
+    splats.antialiased = degree % 2 == 1;
     for i in 0..900 {
         let [x, y, z] = splats.means[i];
         match i % 16 {
@@ -130,7 +138,9 @@ fn rasterised(device: &Device, degree: u32, features: usize, size: [u32; 2]) -> 
     raster.forward(&params, &options).unwrap();
     let frame = raster.frame();
     let pixels = frame.pixels() as usize;
-    frame.planes_grad.write(&numbers((5 + features) * pixels, 7)).unwrap();
+    let mut upstream = numbers((5 + features) * pixels, 7);
+    faulty.into_iter().for_each(|at| upstream[at] = f32::NAN);
+    frame.planes_grad.write(&upstream).unwrap();
     let mut rec = Recorder::new(device, "backward");
     raster.record_backward(&mut rec, &params, &options, &gradients);
     rec.run().unwrap();
@@ -156,7 +166,7 @@ fn rasterised(device: &Device, degree: u32, features: usize, size: [u32; 2]) -> 
 #[test]
 fn rasterisation_matches_shaders() {
     for (degree, features) in [(0, 0), (3, 3), (1, 8), (0, 16), (2, 37)] {
-        let [shader, native] = devices().map(|device| rasterised(&device, degree, features, [75, 53]));
+        let [shader, native] = devices().map(|device| rasterised(&device, degree, features, [75, 53], None));
         for ((name, shader), (_, native)) in shader.iter().zip(&native) {
             let exact = name.starts_with("list");
             // Sums of noise over some hundred pixels, in another order.
@@ -167,6 +177,24 @@ fn rasterisation_matches_shaders() {
                 if exact { 0.0 } else { 3e-4 },
             );
         }
+    }
+}
+
+/// A gradient that is not a number leaves those that are computed beside it as they are.
+#[test]
+fn faulty_gradients_change_no_others() {
+    let [_, native] = devices();
+    for degree in [0, 1] {
+        let [clean, faulty] =
+            [None, Some(20 * 75 + 30)].map(|at| rasterised(&native, degree, 0, [75, 53], at));
+        for ((name, clean), (_, faulty)) in
+            clean.iter().zip(&faulty).filter(|((name, v), _)| name != "camera" && !v.is_empty())
+        {
+            let others = faulty.iter().filter(|v| !v.is_nan()).count();
+            let same = clean.iter().zip(faulty).filter(|(a, b)| a == b).count();
+            assert!(same == others && 2 * others > clean.len(), "{name}: {same} of {others}");
+        }
+        assert!(faulty[3].1.iter().any(|v| v.is_nan()));
     }
 }
 
