@@ -368,6 +368,16 @@ mod tests {
     }
 
     #[test]
+    fn rows_of_groups_cover_large_scenes() {
+        // Splats of a workgroup of 64, and entries of a partition tile.
+        for groups in [0, 1, 32_768, 32_769, 65_536, 20_000_000usize.div_ceil(64), 200_000_000 / 256] {
+            let [x, y, z] = rows_of_groups(groups);
+            assert!(x as usize * y as usize >= groups.max(1) && z == 1, "{groups}");
+            assert!(x <= 65_535 && y <= 65_535, "{groups}: {x} × {y}");
+        }
+    }
+
+    #[test]
     fn sort_at_odd_sizes_matches_reference() {
         for n in [0, 1, 2, 7, 8, 255, 256, 257, 2048, 2049, 50_000] {
             for (bits, range) in [(32, 1u64 << 32), (16, 1 << 16), (10, 1 << 10), (24, 7), (5, 1 << 32)] {
