@@ -129,7 +129,7 @@ pub fn most_splats(device: &DeviceInfo, sh_degree: u32, feature_dim: usize) -> u
 fn too_many(device: &DeviceInfo, splats: usize, most: usize) -> Error {
     Error::input(format!(
         "{splats} splats are more than the {most} that {} renders, whose buffers have at most {} MiB: splatvk view shows \
-         those that cover most, splatvk edit --delete \"opacity<0.1\" thins out a scene, another device may hold more",
+         those that cover most, another --device may hold more",
         device.name,
         device.max_buffer >> 20
     ))
@@ -137,4 +137,24 @@ fn too_many(device: &DeviceInfo, splats: usize, most: usize) -> Error {
 
 fn triples(values: &[f32]) -> Vec<[f32; 3]> {
     values.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::gpu::{Options, TestDevice, options};
+    use crate::scene::seeded;
+
+    #[test]
+    fn too_many_splats_are_refused_with_their_limit() {
+        let device = TestDevice::open(&Options { max_binding: Some(48 * 100), ..options(None) }).unwrap();
+        let upload = |count: usize| {
+            let (splats, _) = seeded::small(count, 40, 30, 0, 1);
+            SplatBuffers::upload(&device, &splats, &[], 0).map(|_| ())
+        };
+        upload(100).unwrap();
+        let e = upload(101).unwrap_err();
+        assert_eq!(e.exit_code(), 2);
+        assert!(e.to_string().starts_with("101 splats are more than the 100 that "), "{e}");
+    }
 }
