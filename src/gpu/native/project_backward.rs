@@ -264,12 +264,7 @@ fn quat_backward<S: Simd>(g: &Geometry<S>, m: [Vec3s<S>; 3]) -> [f32x8<S>; 4] {
 }
 
 pub(super) fn run(call: &mut NativeCall) -> Result<(), String> {
-    match call.variant()[0] {
-        0 => run_with::<1>(call),
-        1 => run_with::<4>(call),
-        2 => run_with::<9>(call),
-        _ => run_with::<16>(call),
-    }
+    sh::with_count!(run_with, call)
 }
 
 fn run_with<const N: usize>(call: &mut NativeCall) -> Result<(), String> {

@@ -4,6 +4,19 @@ use crate::scene::sh::{C0, C1, C2, C3};
 use fearless_simd::{Simd, f32x8, prelude::*};
 use std::ops::Range;
 
+/// Calls `$run::<N>` for a pass whose first variant is the SH degree; N are its coefficients.
+macro_rules! with_count {
+    ($run:ident, $call:expr) => {
+        match $call.variant()[0] {
+            0 => $run::<1>($call),
+            1 => $run::<4>($call),
+            2 => $run::<9>($call),
+            _ => $run::<16>($call),
+        }
+    };
+}
+pub(super) use with_count;
+
 /// Coefficients of splats.
 pub(super) struct Coefficients<'a> {
     numbers: &'a [f32],
